@@ -9,9 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-
-# A motion whose sections differ by less than this share of their size does not turn: a choice.
-_STILL = 1e-9
+from .tolerances import ROUNDING
 
 # Averages agree to so many digits at most, the rounding of double precision.
 _MOST = 16.0
@@ -44,7 +42,7 @@ def agreement(rows: Float[Array, "sections states"]) -> Scalar:
 def digits_of(difference: Array, spread: Array, mean: Array) -> Scalar:
     """Return the number of digits to which averages agree that differ by this, relative to their
     spread; a spread that is rounding of the mean counts as that."""
-    size = spread + _STILL * jnp.abs(mean)
+    size = spread + ROUNDING * jnp.abs(mean)
     share = jnp.max(jnp.abs(difference) / jnp.where(size > 0, size, 1.0))
     return jnp.minimum(-jnp.log10(share + 10.0**-_MOST), _MOST)
 
@@ -59,7 +57,7 @@ def rotation_number(rows: Float[Array, "sections states"]) -> Scalar:
     """
     weight = jnp.asarray(weights(len(rows)))
     centred, size = rows - weight @ rows, jnp.std(rows, axis=0)
-    moves = size > _STILL * jnp.max(jnp.abs(rows), axis=0)
+    moves = size > ROUNDING * jnp.max(jnp.abs(rows), axis=0)
     scaled = jnp.where(moves, centred / jnp.where(moves, size, 1.0), 0.0)
     _, directions = jnp.linalg.eigh(scaled.T @ scaled)
     x, y = (scaled @ directions[:, -2:]).T

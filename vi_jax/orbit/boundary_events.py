@@ -38,8 +38,8 @@ from .corrector import (
     locate_zero,
     on_host,
 )
-from .edit_events import ALIKE, ROUNDED, half_difference, may_be_symmetric, over_periods, repeated
-from .equations import ROUNDING, Shooting
+from .edit_events import half_difference, may_be_symmetric, over_periods, repeated
+from .equations import Shooting
 from .kinds import (
     CROSSING,
     CUSP,
@@ -62,13 +62,14 @@ from .kinds import (
 )
 from .local_map import LocalMap, NoLocalMapError, graze_at
 from .special import Point, point_at
+from .tolerances import ALIKE, LOCATED, ROUNDING, SAME
 from .walk import SAME_CURVE, Ending, Event, Table, bound_rows
 
 # The thresholds here are choices.
 
-# A test that changes its sign without coming this near to zero (as a share of its neighbours) has a
-# pole. The second is for entries of the local map; entries this small are zero.
-_ZERO, _ENTRY = 1e-6, 1e-4
+# A test that changes its sign without coming near to zero (as a share of its neighbours) has a
+# pole; for entries of the local map within this share. Entries this small are zero.
+_ENTRY = 1e-4
 
 # An impact slower than so many roots of a clearance is its turn, for accelerations of up to 50.
 _SAME_TURN = 10.0
@@ -153,7 +154,7 @@ class SpecialTable(Table):
         """Yield the row of a place where the motion becomes symmetric. Beyond, the same motions
         repeat mirrored, and a grazing of one side is passed through on the other."""
         begin = self.image_difference(here)
-        if np.linalg.norm(begin) < ROUNDED:
+        if np.linalg.norm(begin) < SAME:
             return
 
         def ending(at: Step) -> Ending | None:
@@ -236,7 +237,7 @@ def _grazing_impact(step: Step) -> int | None:
     approach = np.asarray(step.observed.approach / step.observed.units)
     # A lost impact comes with a turn near the stop: at a distance of about v² for a speed v. At a
     # touched stop the impacts keep their speed.
-    touches = max(_SAME_TURN * np.sqrt(abs(step.observed.relative_clearance)), _ZERO)
+    touches = max(_SAME_TURN * np.sqrt(abs(step.observed.relative_clearance)), LOCATED)
     if approach.size and approach.min() < touches:
         return int(np.argmin(approach))
     return None
@@ -426,7 +427,7 @@ def _zero(
 ) -> Step | None:
     """Return the point between two where a test, of size `scale` there, is zero without a pole."""
     at = locate_zero(problem, here, new, test)
-    if at is None or abs(test(at)) <= _ZERO * scale:
+    if at is None or abs(test(at)) <= LOCATED * scale:
         return at
     # At a crossing with another curve the corrector fails.
 

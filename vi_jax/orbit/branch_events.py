@@ -47,15 +47,13 @@ from .corrector import (
     orbit_of,
 )
 from .edit_events import (
-    ALIKE,
-    ROUNDED,
     half_difference,
     locate_origin,
     may_be_symmetric,
     may_repeat,
     without_events,
 )
-from .equations import ROUNDING, Shooting, Unknowns
+from .equations import Shooting, Unknowns
 from .flight import LANDS, LEAVES, section_of
 from .flight import Event as MotionEvent
 from .kinds import (
@@ -73,9 +71,10 @@ from .kinds import (
     TURNS,
     WATCHED,
 )
-from .results import NEUTRAL, Orbit
+from .results import Orbit
 from .sliding import change_at, locate_change
 from .special import Point, further_of, point_at
+from .tolerances import ALIKE, LOCATED, ROUNDING, SAME
 from .walk import Ending, Event, Table, bound_rows
 from .words import coincidence_in_words, grazing_in_words, place_in_words
 
@@ -86,9 +85,6 @@ _SHORT = 0.999
 
 # The same share before a lost impact, where the monodromy matrix has a pole.
 _BEFORE_POLE = 1 - 1e-6
-
-# An autonomous motion with this share of another's size is an equilibrium.
-_AT_REST = 1e-6
 
 # A motion with this share of its neighbours' size is about to shrink to rest.
 _SHRINKS = 1e-2
@@ -120,14 +116,6 @@ _MOST_PARABOLAS = 3
 # Cosine of the angle between tangents of one branch so close to each other: a choice.
 _SAME_DIRECTION = 0.99
 
-# A quantity passes zero if it is less than this share of its neighbours; otherwise it jumps.
-_ZERO = 1e-6
-
-# A quantity that changes less than this along the branch (relative, in the norm of the scaled
-# unknowns) changes by rounding only: a choice. The greatest position of a body that hits a stop,
-# the stop's place, changes by some 1e-16.
-_CHANGES = 1e-9
-
 # An extremum is a corner if the rate there exceeds this share of the rates on both sides: a choice,
 # far above the remainder at a place that is located to rounding.
 _CORNER = 1e-4
@@ -155,7 +143,7 @@ class MotionTable(Table):
         if not self.problem.autonomous or not bool(new.good):
             return new
         self.size = self.size or _size_of(self.problem, x)
-        return new._replace(good=np.asarray(_size_of(self.problem, new.x) > _AT_REST * self.size))
+        return new._replace(good=np.asarray(_size_of(self.problem, new.x) > LOCATED * self.size))
 
     def event_rows(self, here: Step, new: Step) -> list[Event]:
         rows = bound_rows(self)
@@ -256,7 +244,7 @@ class MotionTable(Table):
         other. Beyond, the same motions repeat, half a period later or mirrored."""
         for kind, differ in ((DOUBLING, self._half_difference), (SYMMETRY, self.image_difference)):
             begin = differ(here)
-            if np.linalg.norm(begin) < ROUNDED:
+            if np.linalg.norm(begin) < SAME:
                 continue
 
             def ending(at: Step, kind=kind, differ=differ) -> Ending | None:
@@ -279,7 +267,7 @@ class MotionTable(Table):
     def stall_end(self, steps: list[Step]) -> Ending:
         """Return the end at the motion of half the period, if the branch begins at it close by."""
         size = np.linalg.norm(self._half_difference(steps[-1]))
-        found = self._find_origin(steps[-1]) if size > ROUNDED else None
+        found = self._find_origin(steps[-1]) if size > SAME else None
         return super().stall_end(steps) if found is None else Ending(found[0], DOUBLING, found[1])
 
     def _find_origin(self, at: Step) -> tuple[Step, Point] | None:
@@ -313,7 +301,7 @@ class MotionTable(Table):
         self._last_numbers = last.x, self._numbers(last)
         for (kind, name), (value, begin) in before.items():
             other, end = self._last_numbers[1][kind, name]
-            steep, least = max(abs(begin), abs(end)), _CHANGES * max(abs(value), abs(other))
+            steep, least = max(abs(begin), abs(end)), ROUNDING * max(abs(value), abs(other))
             if not begin * end < 0 or (kind == EXTREMUM and steep <= least):
                 continue
             at = self.locate_zero(here, last, lambda s, k=(kind, name): self._numbers(s)[k][1])
@@ -321,7 +309,7 @@ class MotionTable(Table):
                 continue
             value_at_zero, rate = self._numbers(at)[kind, name]
             if kind == WATCHED:
-                is_real, detail = abs(value_at_zero) <= _ZERO * steep, f"{name} passes zero"
+                is_real, detail = abs(value_at_zero) <= LOCATED * steep, f"{name} passes zero"
             else:
                 sense, extreme = (1, "largest") if begin > 0 else (-1, "least")
                 # Otherwise it has a pole, as a multiplier at a grazing.
@@ -463,7 +451,7 @@ class MotionTable(Table):
         if halves.size and np.linalg.norm(halves) < ALIKE:
             return True
         before = np.linalg.norm(self.image_difference(here))
-        return bool(images.size and np.linalg.norm(images) < ALIKE and before > ROUNDED)
+        return bool(images.size and np.linalg.norm(images) < ALIKE and before > SAME)
 
     def _crossing(self, here: Step, at: Step, kind: str) -> Step:
         def admits(step: Step, length: float) -> bool:
@@ -507,7 +495,7 @@ def _changed_tests(here: Step, last: Step, *, held: bool) -> list[str]:
     before, after = bifurcation_tests(here), bifurcation_tests(last)
     changed = [kind for kind in before if before[kind] * after[kind] < 0]
     # Without damping a pair stays on the unit circle, to rounding of either sign.
-    if TORUS in changed and max(abs(before[TORUS]), abs(after[TORUS])) < NEUTRAL:
+    if TORUS in changed and max(abs(before[TORUS]), abs(after[TORUS])) < ROUNDING:
         changed.remove(TORUS)
     if held and FOLD in changed:
         changed.remove(FOLD)
@@ -530,7 +518,7 @@ def _outside_count(step: Step) -> int | None:
     """Return the number of multipliers outside the unit circle; `None` if unknown or one is on
     it."""
     sizes = np.abs(step.observed.multipliers)
-    if not np.isfinite(sizes).all() or (np.abs(sizes - 1) < NEUTRAL).any():
+    if not np.isfinite(sizes).all() or (np.abs(sizes - 1) < ROUNDING).any():
         return None
     return int(np.sum(sizes > 1))
 
@@ -550,12 +538,6 @@ _TINY = 1e-5
 
 # Largest relative difference of an eigenvalue's period from that of the last motion.
 _ALIKE_PERIOD = 0.2
-
-# Zero, relative to the scale of comparison.
-_VANISHES = 1e-9
-
-# Tolerance of a multiplier 1.
-_ONE = 1e-6
 
 
 def _rate(problem: Shooting, machine: AbstractMachine, u: Vector) -> Vector:
@@ -644,7 +626,7 @@ def _hopf_equilibrium(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray,
         y, size = y - step, np.abs(step).max()
         if size <= 1e-14:
             break
-    if not size < _VANISHES or abs(y[n + 1] - 1) >= _ALIKE_PERIOD:
+    if not size < ROUNDING or abs(y[n + 1] - 1) >= _ALIKE_PERIOD:
         return None
     y = y * scale
     vector = y[n + 2 : 2 * n + 2] + 1j * y[2 * n + 2 :]
@@ -657,7 +639,7 @@ def _motion_about(problem: Shooting, here: Step, x: np.ndarray, vector: np.ndarr
     sizes = problem.scale[1:-1]
     section_part, steep = slope @ vector, np.linalg.norm(slope * sizes)
     distance = np.linalg.norm((here.x[1:-1] - x[1:-1]) / sizes)
-    if abs(section_part) <= _VANISHES * steep or abs(section) > _VANISHES * steep * distance:
+    if abs(section_part) <= ROUNDING * steep or abs(section) > ROUNDING * steep * distance:
         return None  # the motion does not cross the section
     # The phase of the linear motion in which the section rises through zero.
     direction = (vector * (-1j * np.conj(section_part))).real
@@ -666,4 +648,4 @@ def _motion_about(problem: Shooting, here: Step, x: np.ndarray, vector: np.ndarr
     x = x + _TINY * distance * direction
     tangent = -direction / problem.scale
     found = here._replace(x=x, tangent=tangent, observed=observe(problem, x))
-    return found if np.abs(found.observed.multipliers - 1).min() < _ONE else None
+    return found if np.abs(found.observed.multipliers - 1).min() < LOCATED else None

@@ -36,15 +36,13 @@ from .from_orbit import (
     with_sizes,
 )
 from .kinds import CROSSING, FOLD, FOLLOWED, SLIDING, SYMMETRY, TOUCHING, with_article
-from .results import NEUTRAL, ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
+from .results import ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
 from .sliding import change_at, without_part
 from .special import Point
+from .tolerances import ALIKE, ROUNDING
 from .walk import check_walk, follow_both_ways, rescaled
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
-
-# The corrector moves an orbit of the cycle map by less than this (scaled): a choice.
-_SAME = 1e-3
 
 
 def continue_orbit(
@@ -245,16 +243,16 @@ def _refined_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
             f"{float(start.size):.2g}). Choose values closer to the orbit's, or other free "
             "parameters: an extreme on a stop, say, does not depend on any."
         )
-    if distance > _SAME:
+    if distance > ALIKE:
         start, distance = _refine(problem, x, tangent_at(problem, x))
-    if distance > _SAME and float(np.abs(np.asarray(orbit.multipliers) - 1).min()) < NEUTRAL:
+    if distance > ALIKE and float(np.abs(np.asarray(orbit.multipliers) - 1).min()) < ROUNDING:
         raise ValueError(
             "Argument `orbit` has a multiplier of exactly 1: branches cross there, or a component "
             "of its state is neutral, such as a free position, a counter, or the place at which "
             "dry friction holds a body. Leave such a component out of the state to follow the "
             "orbit."
         )
-    if distance > _SAME:
+    if distance > ALIKE:
         raise ValueError(
             "Argument `orbit` could not be refined from impact to impact (last correction "
             f"{max(distance, float(start.size)):.2g}): branches cross there, its section lies on "

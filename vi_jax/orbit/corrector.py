@@ -24,11 +24,9 @@ from ..machine import frequency_ratio, own_modes, phase_at, with_modes
 from .equations import Shooting, Unknowns
 from .results import ORBIT_RESULTS, Orbit
 from .root_finders import smallest_solution
+from .tolerances import CORRECTED, LISTED, ROUGHLY
 
 Vector = Float[Array, " n"]
-
-# The largest component of the last correction, in scaled unknowns: usually, and if it is rounding.
-_TOLERANCE, _ROUNDED = 1e-11, 1e-8
 
 # On a curve of double folds the equations do not change to first order in one direction: singular
 # values below this share of the greatest are zero. A choice.
@@ -104,7 +102,7 @@ def _advance(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, lengt
         size = jnp.max(jnp.abs(move))
         # One correction more than needed, so that the tangent is that of the solution. On a steep
         # curve rounding may keep all corrections above the tolerance.
-        done = (before <= _TOLERANCE) | ((before <= _ROUNDED) & (size >= before))
+        done = (before <= CORRECTED) | ((before <= ROUGHLY) & (size >= before))
         return y - move, size, count + 1, along, done
 
     def continues(carry):
@@ -115,7 +113,7 @@ def _advance(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, lengt
     start = (y0, jnp.ones((), x.dtype), jnp.zeros((), jnp.int32), y0, jnp.zeros((), bool))
     y, size, count, along, _ = jax.lax.while_loop(continues, newton, start)
     along = along / jnp.linalg.norm(along)
-    good = (size <= _ROUNDED) & jnp.all(jnp.isfinite(along))
+    good = (size <= ROUGHLY) & jnp.all(jnp.isfinite(along))
     return Step(y * scale, along, size, count, good, None)
 
 
@@ -253,7 +251,7 @@ def locate_zero(
         if np.isnan(found):
             raise NoValueError
         bracket[found > 0] = s
-        resolution = max(min(_ROUNDED, float(points[end].size)) for end in bracket.values())
+        resolution = max(min(ROUGHLY, float(points[end].size)) for end in bracket.values())
         close = len(bracket) == 2 and abs(bracket[True] - bracket[False]) <= resolution
         return 0.0 if close or abs(found) <= _ZERO * max(map(abs, tested.values())) else found
 
@@ -394,10 +392,6 @@ def crossing(
     )
 
 
-# Most impacts of a cycle in the list, with hops of a chatter: a choice. Others are only counted.
-_LISTED = 32
-
-
 class Hits(NamedTuple):
     """The impacts of a motion; for one that rests those of a simulation, hops included."""
 
@@ -457,7 +451,7 @@ def hits_of(problem: Shooting, step: Step, state: State | None = None) -> Hits:
 def _simulate_impacts(problem: Shooting, x: Array, state: State) -> tuple[Array, ...]:
     """Return the number of impacts, and their clocks, V⁻ and stops."""
     machine, cycles = problem.at(x), problem.cycles
-    run = simulate(machine, state, cycles, method=problem.method, impact_log=_LISTED, rests=True)
+    run = simulate(machine, state, cycles, method=problem.method, impact_log=LISTED, rests=True)
     log = run.impact_log
     assert log is not None
     begins = jnp.asarray(machine.cycle, x.dtype) * jnp.arange(cycles)

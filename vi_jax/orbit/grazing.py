@@ -23,6 +23,7 @@ from .flight import Event
 from .local_map import LocalGrazing, LocalMap, graze_at
 from .results import complex_in_words
 from .special import Point
+from .tolerances import CORRECTED
 
 # Longest period that is sought, and the number of iterates in which it is sought.
 LONGEST, SOUGHT = 64, 192
@@ -258,9 +259,6 @@ def _interval(offset: np.ndarray) -> tuple[float, float]:
     return (low, high) if abs(low) <= abs(high) else (high, low)
 
 
-# Differences below this share of the motion are rounding: a choice.
-_ROUNDING = 1e-11
-
 # A distant motion is periodic if it repeats within 1e-6 of its distance: a choice.
 _FAR = 1e-3
 
@@ -315,7 +313,7 @@ def simulate_attractors(graze: LocalGrazing, offsets: np.ndarray) -> SimulatedAt
         u = local.matrix @ u
     unit = np.abs(local.kicks).max()
     reach = np.abs(section.matrix @ local.kicks.T).max() / unit * size
-    rounding = _ROUNDING * np.abs(smooth).max()
+    rounding = CORRECTED * np.abs(smooth).max()
     period = periods_in(displacements, hits, reach + rounding)
     deepest = local_depths(local, offsets) ** (2 * local.orders.min())
     is_away = np.abs(displacements).max(axis=(1, 2)) > kick_sum.max() * deepest + rounding

@@ -23,10 +23,8 @@ from .equations import Shooting
 from .flight import Event, Flight
 from .kinds import with_article
 from .special import Point
+from .tolerances import LOCATED, ROUNDING
 from .turns import Path, turning_points
-
-# A field that differs by less than this share of its size is continuous at a switch: a choice.
-_CONTINUOUS = 1e-9
 
 # Error of the place of a touch, as a share of the state: a choice, ten times the promised one.
 _TOUCH_ERROR = 1e-12
@@ -76,7 +74,7 @@ def soft_kick(
     # A stiff stop pushes by rounding, up to the error of the touch's place.
     place_error = _TOUCH_ERROR * np.abs(gradient) @ np.abs(u) / y**2
     largest = lambda rates: np.abs(rates / sizes).max()
-    rounding = max(_CONTINUOUS * largest(field), place_error * largest(deep_change))
+    rounding = max(ROUNDING * largest(field), place_error * largest(deep_change))
     if largest(change) > rounding:
         rate_beyond = rate + float(fast @ change)
         if rate_beyond <= 0:
@@ -178,11 +176,8 @@ def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np
     return contact_flight(contact_end)[0] - free_end
 
 
-# A turn this near to a stop, as a share of the motion, touches it: as for the special points.
-_TOUCHES = 1e-6
-
 # Touches that are closer than this share of a period are one: the depth between them is then of the
-# order of `_TOUCHES`. A choice.
+# order of `LOCATED`. A choice.
 _SEPARATE = 1e-3
 
 # Speed of approach, as a share of the motion's, at which rebounds are differentiated: laws that
@@ -238,7 +233,7 @@ def find_touches(
     (distances, places), period = _turn_margins(problem, x), float(problem.period(x))
     leg, leg_clock = problem.leg_at(x, clock)
     found = [(number, int(leg), float(leg_clock))]
-    for leg, other, step in np.argwhere(np.abs(distances) <= _TOUCHES):
+    for leg, other, step in np.argwhere(np.abs(distances) <= LOCATED):
         place = float(places[leg, other, step])
         time_differences = [
             abs((place - known + period / 2) % period - period / 2)
@@ -307,10 +302,6 @@ def touch_at(
             f"{called}, whose jump does not vanish with the speed."
         )
     return Touch(number, leg, clock, u, gradient, float(rate), float(slope), kick)
-
-
-# A branch this steep in its parameter (share of a unit step in scaled unknowns) turns back.
-_STEEP = 1e-6
 
 
 class LocalMap(eqx.Module):
@@ -398,7 +389,7 @@ def graze_at(point: Point) -> LocalGrazing:
     problem, x, number, clock = _without_touch(point)
     problem, x = with_least_period(problem, x)
     scale, tangent = problem.scale, tangent_at(problem, x)
-    if abs(tangent[-1]) < _STEEP:
+    if abs(tangent[-1]) < LOCATED:
         raise NoLocalMapError(
             "Argument `point` must be a grazing away from a fold, but the motion without the "
             "impact turns back there in its parameter."

@@ -56,6 +56,7 @@ from ..machine import (
     with_units,
     without_modes,
 )
+from .tolerances import ROUNDING
 
 
 class STABILITY(NamedEnumeration):
@@ -67,10 +68,6 @@ class STABILITY(NamedEnumeration):
     neimark_sacker = "unstable: a complex pair outside the unit circle (past a Neimark–Sacker)"
     neutral = "neutral: neither stable nor unstable to rounding, a multiplier has modulus 1"
     unknown = "without multipliers"
-
-
-# A modulus is 1 within this, in double precision: a choice, ten times `Newton`'s tolerance.
-NEUTRAL = 1e-9
 
 
 def multipliers_of(monodromy: Float[Array, "*batch n n"]) -> Complex[Array, "*batch n"]:
@@ -123,14 +120,14 @@ def stability_of(multipliers: Complex[Array | np.ndarray, "*batch n"]) -> STABIL
     place = array.argmax(abs(multipliers), axis=-1, keepdims=True)
     largest = array.take_along_axis(multipliers, place, axis=-1)[..., 0]
     size = abs(largest)
-    real = abs(largest.imag) <= NEUTRAL * size
+    real = abs(largest.imag) <= ROUNDING * size
     unstable_kind = STABILITY.where(
         real & (largest.real > 0),
         STABILITY.fold,
         STABILITY.where(real, STABILITY.period_doubling, STABILITY.neimark_sacker),
     )
     verdict = STABILITY.where(size < 1, STABILITY.stable, unstable_kind)
-    rounding = max(NEUTRAL, 100 * float(jnp.finfo(size.dtype).eps))
+    rounding = max(ROUNDING, 100 * float(jnp.finfo(size.dtype).eps))
     verdict = STABILITY.where(abs(size - 1) <= rounding, STABILITY.neutral, verdict)
     return STABILITY.where(array.isnan(size), STABILITY.unknown, verdict)
 

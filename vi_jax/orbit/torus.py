@@ -38,9 +38,8 @@ from ..machine import (
 from .birkhoff import agreement, rotation_number, weights, without_angles
 from .corrector import on_host
 from .cycle_map import CycleMap, cycle_map, map_state
-from .equations import ROUNDING, Observed, Shooting
+from .equations import Observed, Shooting
 from .from_orbit import (
-    LISTED,
     begins_after_jump,
     equations_along,
     fixed_step_method,
@@ -51,6 +50,7 @@ from .from_orbit import (
 )
 from .results import Orbit
 from .special import Point
+from .tolerances import LISTED, ROUNDING, SAME
 from .torus_equations import (
     Curve,
     Equations,
@@ -77,10 +77,6 @@ _REPEATS, _LONGEST = 1e-8, 512
 
 # The curve through a run is near its sections, relative to their sizes: a choice.
 _NEAR = 0.1
-
-# A curve whose first mode is smaller than this share of its state is a fixed point: a choice, far
-# above the corrector's tolerance. With it any ρ would solve the equations.
-POINT = 1e-7
 
 # Steps of the exponents' averages, and those before. Two exponents are equal if they differ by less
 # than this multiple of the difference between both halves of the steps. Choices.
@@ -205,7 +201,7 @@ class Torus:
     def reason(self) -> str:
         """The reason why this is not a quasi-periodic motion of the machine; "" if it is one."""
         lowest = min(self.margins, key=lambda margin: margin.share)
-        if first_mode(self.equations, self.curve)[1] < POINT:
+        if first_mode(self.equations, self.curve)[1] < SAME:
             return "The curve has shrunk to a periodic motion, which any rotation number solves."
         if self.tail > RESOLVED:
             return (

@@ -16,9 +16,9 @@ from .find import find_orbit
 from .from_orbit import check_parameter
 from .kinds import GRAZING, TORUS
 from .results import Orbit
+from .tolerances import SAME
 from .torus import (
     MOST,
-    POINT,
     REORDERED,
     RESOLVED,
     Torus,
@@ -249,7 +249,7 @@ class _Walk:
         if new is None or equations.tail(new.curve) > _SPURIOUS:
             return STALLED if new is None else COARSE
         (before, _), (after, size) = (first_mode(equations, c) for c in (here, new.curve))
-        if np.vdot(before, after).real <= 0 or size < POINT:
+        if np.vdot(before, after).real <= 0 or size < SAME:
             return TORUS
         if equations.unit(new.tangent) @ equations.pack(ahead) < SAME_CURVE:
             return STALLED

@@ -25,17 +25,17 @@ from .._types import State
 from ..machine import own_modes, with_modes
 from .corrector import on_host, scaled_jacobian
 from .equations import Shooting
+from .tolerances import CORRECTED, ROUGHLY
 
 # Rows that a compiled program takes at once, a choice: fewer are filled up.
 _LANES = 64
 
-# The largest scaled component of the last correction: usually (the next would be its square), and
-# if it is rounding; the most corrections; the largest one that is made at once. Choices.
-_TOLERANCE, _ROUNDED, _MOST, _LONGEST = 1e-9, 1e-8, 14, 0.3
+# The largest scaled component of the last correction (the next would be its square), if rounding
+# does not keep it above; the most corrections; the largest one that is made at once. Choices.
+_TOLERANCE, _MOST, _LONGEST = 1e-9, 14, 0.3
 
-# The tail of a spectrum are the modes above this share of the highest. Nodes are doubled until it
-# is below the second number; it falls by some digits with each doubling. Choices.
-_TAIL, _SETTLED = 0.8, 1e-11
+# The tail of a spectrum are the modes above this share of the highest: a choice.
+_TAIL = 0.8
 
 
 def in_lanes(program: Callable[..., Any], shared: Any, *rows: np.ndarray) -> Any:
@@ -249,7 +249,7 @@ class Equations:
             size = max(np.abs(move.x / self.scale).max(), *np.abs(moves[0][move.x.size :]))
             share = min(1.0, _LONGEST / size) if size > 0 else 1.0
             curve = curve.plus(share, move)
-            if size <= _TOLERANCE or (before <= _ROUNDED and size >= before):
+            if size <= _TOLERANCE or (before <= ROUGHLY and size >= before):
                 return Solved(curve, float(size), count, tangent)
             before = size
         return None
@@ -335,8 +335,11 @@ class Equations:
     def refined(self, solved: Solved | None, most: int) -> Solved | None:
         """Double the nodes until the tail is small, or more than `most` were needed; `None` if the
         equations are not solved, then or before."""
-        while solved and self.tail(solved.curve) > _SETTLED and 2 * len(solved.curve.x) - 1 <= most:
-            finer = solved.curve.with_nodes(2 * len(solved.curve.x) - 1)
+        while solved and self.tail(solved.curve) > CORRECTED:
+            nodes = 2 * len(solved.curve.x) - 1
+            if nodes > most:
+                break
+            finer = solved.curve.with_nodes(nodes)
             held = [self.across(finer, solved.tangent)] if len(finer.p) else []
             solved = self.solve(finer, [self.phase(finer), *held])
         return solved
@@ -349,6 +352,6 @@ class Equations:
 
         own, after, *_ = self._linearized(point, point.x)
         values, vectors = eig(own[0], -after[0])  # pyright: ignore
-        turns = np.isfinite(values) & (np.imag(values) > _ROUNDED)
+        turns = np.isfinite(values) & (np.imag(values) > ROUGHLY)
         i = int(np.argmin(np.where(turns, np.abs(np.abs(values) - 1), np.inf)))
         return float(np.angle(values[i]) / (2 * np.pi)), vectors[:, i]

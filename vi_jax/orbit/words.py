@@ -6,9 +6,7 @@ from ..machine import RigidStop, SoftStop, clock_in_words
 from .corrector import Step, since_section
 from .equations import Shooting
 from .flight import Event
-
-# Events closer than this coincide (a cycle is 2π): a choice, above the errors of places.
-TOGETHER = 1e-6
+from .tolerances import LOCATED
 
 
 def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
@@ -19,7 +17,7 @@ def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
 def coincidence_in_words(problem: Shooting, at: Step) -> str:
     lengths, place_of_both = problem.lengths(at.x), ""
     i = int(np.argmin(lengths))
-    if lengths[i] < TOGETHER * problem.radian:
+    if lengths[i] < LOCATED * problem.radian:
         names = [problem.events[j % problem.legs].name_on(problem.machine) for j in (i, i + 1)]
         place = place_in_words(problem, at, float(problem.values(at.x)[0][i]))
         place_of_both = f" ({' and '.join(names)}, {place})"
