@@ -24,11 +24,12 @@ from ..machine import (
     units_of,
     with_units,
 )
-from .boundary_events import cosine_of, points_of
+from .codimension_two import cosine_of, points_of
 from .conditions import Special, held_in_words
-from .corrector import Hits, Step, energies_of, hits_of, locate_zero, orbit_of, sections_at
+from .corrector import Hits, Step, energies_of, hits_of, orbit_of, sections_at
 from .equations import Observed, Shooting
 from .kinds import TORUS
+from .locate import locate_zero
 from .results import Orbit, stability_of
 from .special import Point
 from .tolerances import EXACT, ROUNDING

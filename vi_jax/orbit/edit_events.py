@@ -14,18 +14,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..machine import AbstractMachine, in_rows, nearest_images, stops_of
-from .corrector import (
-    Step,
-    advance,
-    find_zero_near,
-    observe,
-    on_host,
-    sections_at,
-    state_at,
-    tangent_at,
-)
+from .corrector import Step, advance, observe, on_host, sections_at, state_at, tangent_at
 from .equations import Shooting
 from .flight import Event, section_of
+from .locate import find_zero_near
 from .tolerances import ROUNDING, SAME
 
 

@@ -27,11 +27,12 @@ from ..machine import (
     guard_of,
     mode_number,
 )
-from .corrector import Step, find_zero_near, observe, on_host, state_at
+from .corrector import Step, observe, on_host, state_at
 from .edit_events import without_events
 from .equations import Leg, Shooting
 from .flight import Event, Flight
 from .kinds import ADDING_SLIDING, CROSSING_SLIDING, GRAZING_SLIDING, SWITCHING_SLIDING
+from .locate import find_zero_near
 from .tolerances import LOCATED, ROUGHLY
 
 # A part of a motion vanishes if it is shorter than the first share of the period. The second share

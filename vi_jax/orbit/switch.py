@@ -13,18 +13,9 @@ import numpy as np
 from .._types import State
 from ..flow import simulate
 from ..machine import after_event, others_of, with_leaf
-from .boundary_events import PERIODS
+from .codimension_two import PERIODS
 from .conditions import AbstractCondition, FixedComponent, Special, bifurcation_tests
-from .corrector import (
-    Step,
-    advance,
-    jacobian_at,
-    locate_zero,
-    orbit_of,
-    sections_at,
-    state_at,
-    tangent_at,
-)
+from .corrector import Step, advance, jacobian_at, orbit_of, sections_at, state_at, tangent_at
 from .edit_events import admissible_near, over_periods, repeated, without_events
 from .equations import Shooting
 from .find import find_orbit
@@ -48,6 +39,7 @@ from .kinds import (
     starts,
 )
 from .local_map import graze_at
+from .locate import locate_zero
 from .results import Orbit
 from .sliding import change_at, without_part
 from .special import Point, point_at

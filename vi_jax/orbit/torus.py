@@ -187,9 +187,8 @@ class Torus:
         number = along.shape[1] - 1 - self.problem.autonomous
         rates = np.asarray(_growth(jnp.asarray(matrices), jnp.asarray(along), number))[_SKIPPED:]
         found = weights(_STEPS) @ rates
-        error = np.abs(np.diff(weights(_STEPS // 2) @ np.reshape(rates, (2, -1, number)), axis=0))[
-            0
-        ]
+        first, second = weights(_STEPS // 2) @ rates.reshape(2, -1, number)
+        error = np.abs(first - second)
         # A pair that turns in its plane has one exponent, but the averages of each of the two
         # converge slowly: only their sum does not depend on the directions.
         for k in range(number - 1):

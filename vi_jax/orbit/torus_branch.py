@@ -217,7 +217,7 @@ class _Walk:
         most: int,
     ):  # fmt: skip
         self.equations, self.bounds, self.most = equations, bounds, most
-        ahead = Curve(*(sense * a for a in start.tangent))  # pyright: ignore
+        ahead = start.tangent.plus(sense - 1.0, start.tangent)
         self.points, self.windows = [equations.directed(start, ahead)], []
         self.end = _End(INTERRUPTED)
 

@@ -118,14 +118,6 @@ def derivative(rows: np.ndarray) -> np.ndarray:
     return np.fft.ifft(np.fft.fft(rows, axis=0) * waves, axis=0).real
 
 
-def spectral_tail(rows: np.ndarray) -> float:
-    """Return the largest high mode of a curve, relative to its largest mode."""
-    size, number = np.abs(np.fft.fft(rows, axis=0)).max(axis=1), np.abs(modes(len(rows)))
-    largest = size[number > 0].max(initial=0.0)
-    high = size[number > _TAIL * (len(rows) // 2)].max()
-    return float(high / largest) if largest > 0 else 1.0
-
-
 def angles_of(number: int) -> np.ndarray:
     """Return the angles of so many nodes, in turns."""
     return np.arange(number) / number
@@ -148,10 +140,10 @@ class Curve(NamedTuple):
         """Return the curve at a share of the way to another one."""
         nodes = max(len(self.x), len(other.x))
         here, there = self.with_nodes(nodes), other.with_nodes(nodes)
-        return here.plus(share, Curve(*(b - a for a, b in zip(here, there, strict=True))))  # pyright: ignore
+        return here.plus(share, jax.tree.map(np.subtract, there, here))
 
     def plus(self, share: float, change: "Curve") -> "Curve":
-        return Curve(*(a + share * b for a, b in zip(self, change, strict=True)))  # pyright: ignore
+        return jax.tree.map(lambda a, b: a + share * b, self, change)
 
 
 Condition = tuple[np.ndarray, float]
@@ -160,8 +152,6 @@ Condition = tuple[np.ndarray, float]
 
 class Solved(NamedTuple):
     curve: Curve
-    size: float
-    """The largest scaled component of the last correction."""
     iterations: int
     tangent: Curve
     """The change of the unknowns for a change of the last condition's value."""
@@ -194,7 +184,12 @@ class Equations:
         return Curve(x, float(row[end]), row[end + 1 :] * self.widths)
 
     def tail(self, curve: Curve) -> float:
-        return spectral_tail(curve.x / self.scale)
+        """Return the largest high mode of a curve, relative to its largest mode."""
+        size = np.abs(np.fft.fft(curve.x / self.scale, axis=0)).max(axis=1)
+        number = np.abs(modes(len(size)))
+        largest = size[number > 0].max(initial=0.0)
+        high = size[number > _TAIL * (len(size) // 2)].max()
+        return float(high / largest) if largest > 0 else 1.0
 
     def motion(self, p: np.ndarray) -> Shooting:
         """Return the equations of the motion alone at these values of the parameters."""
@@ -250,7 +245,7 @@ class Equations:
             share = min(1.0, _LONGEST / size) if size > 0 else 1.0
             curve = curve.plus(share, move)
             if size <= _TOLERANCE or (before <= ROUGHLY and size >= before):
-                return Solved(curve, float(size), count, tangent)
+                return Solved(curve, count, tangent)
             before = size
         return None
 
