@@ -35,10 +35,11 @@ from .kinds import (
     TORUS,
     TOUCHING,
 )
-from .local_map import LocalMap, NoLocalMapError, graze_at
+from .local_map import LocalMap, graze_at
 from .locate import crossing, dip_of, locate_zero
 from .special import Point, point_at
 from .tolerances import ALIKE, LOCATED
+from .touch import NoLocalMapError
 from .walk import SAME_CURVE
 
 # The thresholds here are choices.
