@@ -15,7 +15,7 @@ from jax.extend.core import Jaxpr
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from .._checks import concrete, fields_with
+from .._checks import concrete, fields_with, outside_of_traces
 from .._types import Scalar, State
 from ..lanes import called, propagate_marks
 from ..machine import (
@@ -201,7 +201,7 @@ def _jumping(averages: _Averages) -> str | None:
     def values(s: Scalar, state: State) -> dict[str, Array]:
         return {name: jnp.asarray(x) for name, x in machine.averages(s, state, *modes).items()}
 
-    with jax.ensure_compile_time_eval():
+    with outside_of_traces():
         row, unravel = ravel_pytree(jtu.tree_map(jnp.asarray, (0.0, state)))
         jaxpr = jax.make_jaxpr(lambda x: values(*unravel(x)))(row).jaxpr
         if not _decides(jaxpr, [True]):

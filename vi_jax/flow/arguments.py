@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -35,7 +36,6 @@ from .._types import Machine, State
 from ..machine import (
     AbstractMachine,
     Mechanical,
-    Scene,
     Turn,
     begin_modes,
     check_takes,
@@ -59,6 +59,7 @@ from ..machine import (
     without_modes,
 )
 from ..machine import State as NamedState
+from ..machines import Scene
 from ._quantities import average_names, check_units, quantity_names
 from .history import check_delays, with_memory
 from .machine_checks import (
@@ -182,7 +183,7 @@ def make_plan(
             "vi_jax is running in single precision: errors near 1e-6 and tolerances to match. For "
             'double precision call `jax.config.update("jax_enable_x64", True)` first.'
         )
-    dtype = machine.position(start).dtype
+    dtype = jax.eval_shape(machine.position, start).dtype
     options.check_limits(dtype)
     max_steps, rests = options.max_steps, options.rests
     plan = Plan(
@@ -356,7 +357,8 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
                 f"`machine.at(...)` returns, but got {state!r}."
             )
     try:
-        shape = jnp.shape(machine.position(state)) or jnp.shape(machine.velocity(state))
+        place, velocity = _evaluated(machine, lambda x, z: (x.position(z), x.velocity(z)), state)
+        shape = jnp.shape(place) or jnp.shape(velocity)
     except (AttributeError, TypeError, LookupError) as error:
         raise TypeError(
             f"Argument `{argument}` must be a state of this machine, but got {state!r}: "
@@ -367,6 +369,15 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
     if not shape and not has_velocity(machine, state):
         _check_flow(argument, machine, state)
     return shape
+
+
+def _evaluated(
+    machine: AbstractMachine, function: Callable[[Any, State], Any], state: State
+) -> Any:
+    """Return `function(machine, state)`: of a machine with gaps that are functions by one program,
+    not by one for each operation."""
+    has_functions = any(callable(getattr(x, "on", None)) for x in contacts_in(machine))
+    return (eqx.filter_jit(function) if has_functions else function)(machine, state)
 
 
 def _check_turn(machine: AbstractMachine, start: State) -> None:
@@ -431,9 +442,10 @@ def check_start(machine: AbstractMachine, start: State, repeats: bool = True) ->
     if isinstance(start, eqx.Module):
         require_ranges(start)
     _check_turn(machine, start)
+    positions = lambda machine, x: [each.position(x) for each in machine.coordinates]
+    places = _evaluated(machine, positions, start)
     for i, stop in enumerate(stops_of(machine)):
-        gap = concrete(stop.gap)
-        Y = concrete(machine.coordinates[stop.coordinate].position(start))
+        gap, Y = concrete(stop.gap), concrete(places[stop.coordinate])
         if Y is None or gap is None:
             continue
         depth = np.max(stop.sign * Y - gap)

@@ -1,4 +1,4 @@
-"""Machines: states, coordinates, contacts, events, drives, and the paper's scene."""
+"""What a machine is: states, coordinates, contacts, events and cycles."""
 
 # The names that other packages import.
 # ruff: noqa: F401, I001
@@ -9,9 +9,9 @@ from .base import (
     names_on, number_on, renews,
 )
 from .clocks import (
-    as_logged, at_section, clock_in_words, clock_word, convert_start, cycle_time, cycles_in_words,
-    frequency_ratio, in_clock, in_cycle_clock, in_cycle_state, is_alive, is_in_range,
-    logged_turn, may_rest, phase_at, prepared, scales_known,
+    Prepared, as_logged, at_section, clock_in_words, clock_word, convert_start, cycle_time,
+    cycles_in_words, frequency_ratio, in_clock, in_cycle_clock, in_cycle_state, is_alive,
+    is_in_range, logged_turn, may_rest, phase_at, prepared, scales_known,
 )
 from .contact_forces import contact_forces
 from .contacts import (
@@ -32,10 +32,6 @@ from .delay import (
     recorded_numbers, with_some_past, without_past,
 )
 from .delay_chain import delay_chain, history_in, machine_of_chain
-from .drives import (
-    AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, OscillatorState, Slide,
-    SliderCrank,
-)
 from .event import AbstractEvent, AbstractSwitch
 from .events import (
     HybridState, Reset, Switch, after_event, begin_modes, begun, constant_modes,
@@ -47,15 +43,13 @@ from .events import (
 from .friction import (
     ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_modes, shared_loads,
 )
-from .linear import LinearMachine, ModalMachine, Prepared, StructureState, modal
 from .mechanical import Mechanical, solved
 from .numbers import (
     PLAIN, QUANTITIES, Shown, Stated, Summarized, attributes, by_name, check_again, check_leaf,
-    check_name, components, drive_speed, first_few, in_brackets, in_rows, in_unit, in_words, leaf,
-    leaf_names, name_in, near_names, number_in_words, plain, quantity_of, size_of, state_in_words,
-    stated, unit_of, units_of, with_leaf, with_leaves, with_unit, with_units,
+    check_name, components, drive_speed, first_few, in_brackets, in_rows, in_unit, in_words, known,
+    leaf, leaf_names, name_in, near_names, number_in_words, plain, quantity_of, size_of,
+    state_in_words, stated, unit_of, units_of, with_leaf, with_leaves, with_unit, with_units,
 )
-from .scene import Parameters, Scene
 from .settle import strike
 from .state import State, like
 from .stop import AbstractContactLaw, HuntCrossley, PowerLaw, RigidStop, SoftStop, stop_in_words

@@ -143,16 +143,18 @@ def event_of(
 
 
 def begin_modes(
-    machine: Machine, s: Scalar, state: State, own: Sequence[Any] | None = None
-) -> Modes:
+    machine: Machine, s: Scalar, state: State, own: Sequence[Any] | None = None, *,
+    settles: bool = True,
+) -> Modes:  # fmt: skip
     """Return the initial modes of a motion in `state`: those of events, in their order, then the
-    machine's own, which are `own` if that is given."""
+    machine's own, which are `own` if that is given. Unless it `settles`, no mode depends on
+    others."""
     state = jtu.tree_map(jnp.asarray, state)  # a start may hold Python's numbers
     mode_events = [event for event in events_of(machine) if event.holds_mode]
     own = modes_at_start(machine, s, state) if own is None else own
     modes = [*(event.begin(machine, s, state) for event in mode_events), *own]
     modes = constant_modes(modes, s)
-    if any(event.needs_all_modes for event in mode_events):  # their modes depend on the others
+    if settles and any(event.needs_all_modes for event in mode_events):
         modes = struck_modes(machine, s, state, modes)
     return modes
 

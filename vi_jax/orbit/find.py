@@ -38,7 +38,6 @@ from ..flow import (
 from ..machine import (
     AbstractMachine,
     HybridState,
-    Scene,
     angles_in,
     begin_modes,
     frequency_ratio,
@@ -52,6 +51,7 @@ from ..machine import (
     with_modes,
     without_modes,
 )
+from ..machines import Scene
 from .cycle_map import CycleMap, axes_of, batch_together, cycle_map, forward_jacobian, map_state
 from .delay import as_chain, with_delay_error
 from .results import ORBIT_RESULTS, Orbit, distance, multipliers_of, trimmed
