@@ -69,9 +69,6 @@ from .words import coincidence_in_words, grazing_in_words, place_in_words
 # Events before the place where a branch begins are located on this share of the way.
 _SHORT = 0.999
 
-# The same share before a lost impact, where the monodromy matrix has a pole.
-_BEFORE_POLE = 1 - 1e-6
-
 # A motion with this share of its neighbours' size is about to shrink to rest.
 _SHRINKS = 1e-2
 
@@ -219,9 +216,9 @@ class MotionTable(Table):
         detail = grazing_in_words(self.problem, at, impact)
         if impact is None:
             return self._end_with(GRAZING, at, detail)
-        # A multiplier goes to infinity there and returns from the other side. Its sign is that of
-        # rounding, and the tests for bifurcations may have changed sign twice.
-        before_pole = self._partway(here, at, _BEFORE_POLE)
+        # At a lost impact a multiplier goes to infinity and returns from the other side. Its sign
+        # is that of rounding, and the tests for bifurcations may have changed sign twice.
+        before_pole = self._partway(here, at, 1 - LOCATED)
         before_pole = before_pole if bool(before_pole.good) else at
         M, values = before_pole.observed.monodromy, before_pole.observed.multipliers
         at = at._replace(observed=at.observed._replace(monodromy=M, multipliers=values))

@@ -23,13 +23,9 @@ from ..machine import frequency_ratio, own_modes, phase_at, with_modes
 from .equations import Shooting, Unknowns
 from .results import ORBIT_RESULTS, Orbit
 from .root_finders import smallest_solution
-from .tolerances import CORRECTED, LISTED, ROUGHLY
+from .tolerances import CORRECTED, LISTED, LOCATED, ROUGHLY
 
 Vector = Float[Array, " n"]
-
-# On a curve of double folds the equations do not change to first order in one direction: singular
-# values below this share of the greatest are zero. A choice.
-_DOUBLE = 1e-6
 
 
 class Step(NamedTuple):
@@ -94,8 +90,8 @@ def _advance(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, lengt
         y, before, count, *_ = carry
         jacobian, residual, _ = scaled_jacobian(equations, y)
         right_sides = jnp.stack([residual, jnp.zeros_like(y).at[-1].set(1.0)], axis=-1)
-        if problem.is_double:
-            move, along = smallest_solution(jacobian, right_sides, _DOUBLE).T
+        if problem.is_double:  # singular to first order in one direction
+            move, along = smallest_solution(jacobian, right_sides, LOCATED).T
         else:
             move, along = jnp.linalg.solve(jacobian, right_sides).T
         size = jnp.max(jnp.abs(move))

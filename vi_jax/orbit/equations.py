@@ -704,13 +704,7 @@ class Shooting(eqx.Module):
         event. The jump is differentiated where the body is, without moving it onto its stop
         (`jump_of`): ∇g accounts for the change of the event's time.
         """
-        old, new = (
-            self.flight(machine, leg - 1).smooth,
-            self.flight_after_event(machine, leg).smooth,
-        )
-
-        def field(machine, u):
-            return ravel_pytree(machine.field(s, self.unravel(u)))[0]
+        old, new = self.flight(machine, leg - 1), self.flight_after_event(machine, leg)
 
         def jumped(event, u):
             if event.use == LEAVES:
@@ -722,7 +716,7 @@ class Shooting(eqx.Module):
             return self._for_event(leg, jumped, u)
 
         jacobian = jax.jacfwd(reset)(u)
-        before, after = field(old, u), field(new, reset(u))
+        before, after = old.rate(s, u), new.rate(s, reset(u))
         if self.autonomous:
             # The clock restarts there, so a perturbation along the motion vanishes.
             clock_continues = [float(i > 0 and not event.of(machine).ends_cycle)

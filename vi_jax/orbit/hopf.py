@@ -10,7 +10,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .._types import Scalar, Vector
@@ -28,8 +27,7 @@ _ALIKE_PERIOD = 0.2
 
 
 def _rate(problem: Shooting, machine: AbstractMachine, u: Vector) -> Vector:
-    smooth = problem.flight(machine, 0).smooth
-    return ravel_pytree(smooth.field(jnp.zeros((), u.dtype), problem.unravel(u)))[0]
+    return problem.flight(machine, 0).rate(jnp.zeros((), u.dtype), u)
 
 
 @on_host

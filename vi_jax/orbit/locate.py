@@ -15,9 +15,9 @@ from .tolerances import ROUGHLY
 # Distances, as shares of the step, to retry before a place without a solution: choices.
 _RETRIES = (1e-6, 1e-5, 1e-4, 1e-3)
 
-# A test is zero below this share of its largest value. A place is accurate to the second number in
-# scaled unknowns, or to the last correction. Choices: closer, rounding would be resolved.
-_ZERO, _PLACED = 1e-13, 1e-13
+# A test is zero below this share of its largest value. A place is accurate to that in scaled
+# unknowns, or to the last correction. A choice: closer, rounding would be resolved.
+_PLACED = 1e-13
 
 # The search stops after this number of places without a solution: around a singularity of the
 # equations only the corrector's rounding would be resolved. A choice.
@@ -83,7 +83,7 @@ def locate_zero(
         bracket[found > 0] = s
         resolution = max(min(ROUGHLY, float(points[end].size)) for end in bracket.values())
         close = len(bracket) == 2 and abs(bracket[True] - bracket[False]) <= resolution
-        return 0.0 if close or abs(found) <= _ZERO * max(map(abs, tested.values())) else found
+        return 0.0 if close or abs(found) <= _PLACED * max(map(abs, tested.values())) else found
 
     from scipy.optimize import brentq  # slow to load
 

@@ -72,8 +72,7 @@ def _rates(problem: Shooting, x):
 
     def rate(x):
         clock, states = problem.parts(x)
-        smooth = problem.flight(problem.at(x), problem.legs - 1).smooth
-        return ravel_pytree(smooth.field(clock[0], problem.unravel(states[0])))[0]
+        return problem.flight(problem.at(x), problem.legs - 1).rate(clock[0], states[0])
 
     return jax.vmap(rate)(x)
 

@@ -109,8 +109,7 @@ def _fields_at_surface(problem: Shooting, x, number: int, leg, s, u):
     machine = problem.at(x)
     modes = _modes_around_switch(problem, machine, number, leg, s, u)
     flights = [Flight(machine, m, problem.method, problem.like) for m in modes]
-    state = problem.unravel(u)
-    return jnp.stack([ravel_pytree(flight.smooth.field(s, state))[0] for flight in flights])
+    return jnp.stack([flight.rate(s, u) for flight in flights])
 
 
 @on_host

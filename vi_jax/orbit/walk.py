@@ -36,13 +36,10 @@ SHORTER = "shorter"
 
 # The numbers below are choices where no measurement is given.
 
-# The tangents of two points close to each other on one curve have at least this product.
+# The tangents of two points close to each other on one curve have at least this product: they turn
+# by less than 26°. A step stays within half that angle of its first tangent; one with a smaller
+# cosine than this has reached another curve, beyond a jump of the equations, or another part.
 SAME_CURVE = 0.9
-
-# A step with a tangent that turns by less than 26° (as the walk requires) stays within half that
-# angle of its first tangent. A step with a smaller cosine than this has reached another curve,
-# beyond a jump of the equations, or another part.
-_LEAST_COSINE = 0.9
 
 # A walk stalls if its steps must be shorter than this share of the longest. The shortest
 # steps that the branches of the tests need are 2e-3 of it.
@@ -61,10 +58,6 @@ _WARN_ABOVE = 1e-8
 
 # A curve begins at the zero of a test that is at most this share of its value a step further on.
 _ZERO_AT_START = 1e-7
-
-# A walk that stalls this close to a bound (in the parameter's scale) is extended to it. This is a
-# few times the remainder of its shortest steps.
-_NEAR_BOUND = 1e-6
 
 
 class Ending(NamedTuple):
@@ -115,7 +108,7 @@ class Table(abc.ABC):
     def advance(self, x: Any, tangent: Any, length: Any) -> Step:
         new = advance(self.problem, x, tangent, length)
         distance = float(np.linalg.norm((new.x - np.asarray(x)) / self.scale))
-        deviates = distance > LOCATED and not abs(length) >= _LEAST_COSINE * distance
+        deviates = distance > LOCATED and not abs(length) >= SAME_CURVE * distance
         return new._replace(good=np.asarray(False)) if deviates else new
 
     def locate_zero(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
@@ -286,7 +279,7 @@ class _Walk:
         for i, ends in enumerate(table.bounds, -len(table.bounds)):
             for bound in ends:
                 length = (bound - float(last.x[i])) / table.scale[i]
-                if abs(length) < _NEAR_BOUND:
+                if abs(length) < LOCATED:  # a few times the remainder of the shortest steps
                     at = advance(table.problem, last.x, axes[i], length)
                     if bool(at.good):
                         return Ending(at, BOUNDS)
@@ -351,7 +344,7 @@ def bound_rows(table: Table) -> list[Event]:
             return sense * (float(step.x[i]) - bound) / float(table.scale[i])
 
         def ending(at: Step) -> Ending:
-            return Ending(at, BOUNDS if abs(distance(at)) < _NEAR_BOUND else SHORTER)
+            return Ending(at, BOUNDS if abs(distance(at)) < LOCATED else SHORTER)
 
         return Event(distance, ending)
 
