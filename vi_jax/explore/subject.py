@@ -34,7 +34,7 @@ from ..machine import (
     with_unit,
 )
 from ..machines import Parameters, Scene
-from ..orbit import STABILITY, complex_in_words, cycle_map, multipliers_of, stability_of
+from ..orbit import STABILITY, cycle_map, multipliers_in_words, multipliers_of, stability_of
 from ..plot import MotionPath, axis_name, motion_path
 from ..scans import REGIMES, Regime, lyapunov, moved_by_stops
 
@@ -134,7 +134,7 @@ class Motion(NamedTuple):
         verdict = STABILITY[stability_of(jnp.asarray(self.multipliers))]
         if abs(abs(self.multipliers[0]) - 1) < _NEUTRAL:
             verdict = STABILITY[STABILITY.neutral]
-        values = ", ".join(complex_in_words(m, 4, _NEUTRAL) for m in self.multipliers)
+        values = ", ".join(multipliers_in_words(self.multipliers, 4, _NEUTRAL))
         return f"multipliers {values}: {verdict}"
 
 

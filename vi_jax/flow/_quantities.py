@@ -23,6 +23,7 @@ from ..machine import (
     QUANTITIES,
     AbstractMachine,
     begin_modes,
+    check_takes,
     components,
     is_builtin,
     leaf_names,
@@ -131,6 +132,7 @@ def _checked_names(
     """Return the names of a machine's averages or quantities (`attribute`), sorted; names of
     components of `start` are in use already. **Raises:** as `average_names`."""
     label = f"`{attribute}` of a {type(machine).__name__}"
+    check_takes(function, label, "`s`, the state", arguments, len(arguments) - 2)
     with explain_errors(label):
         found = jax.eval_shape(lambda *x: _as_arrays(label, function(*x)), *arguments)
     taken = _RESERVED | set(leaf_names(machine)) | set(components(start))

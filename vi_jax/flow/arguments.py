@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -158,6 +158,7 @@ def make_plan(
     require_session("start", start)
     if has_delays(machine):
         check_delays(machine, method)
+        check_finite("start", start)
         machine, memory = with_memory(machine, as_floats(machine, start), history)
     method.check(machine)
     if samples and is_autonomous(machine, start):
@@ -313,9 +314,10 @@ def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
     except (AttributeError, TypeError, ValueError, LookupError) as error:
         if str(error).partition(" must ")[0].endswith(f"of a {type(machine).__name__}"):
             raise
+        hint = ". Pass `vi.State(x=0.0, ...)`." if isinstance(state, Mapping) else ""
         raise TypeError(
             f"Argument `{argument}` must be a state of this machine, but got {state!r}, whose "
-            f"rate cannot be computed: {error}"
+            f"rate cannot be computed: {error}{hint}"
         ) from None
 
 
@@ -340,6 +342,14 @@ def check_reals(name: str, state: State) -> None:
         require_real(name, part, x)
 
 
+def check_finite(argument: str, state: State) -> None:
+    """**Raises:** `ValueError` that names a part of a state that is not finite."""
+    for part, x in named_leaves(state):
+        numbers = concrete(x)
+        if numbers is not None and not np.isfinite(numbers).all():
+            raise ValueError(f"Argument `{argument}` must be finite, but its {part} is {numbers}.")
+
+
 def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int, ...]:
     """Return the shape of position and velocity in a state, `()` in a single one. **Raises:**
     `TypeError` for an invalid state of this machine."""
@@ -352,6 +362,12 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
             words = (
                 f"{name} of shape {shape}" if shape else name for name, shape in wanted.items()
             )
+            other = next((x for x in given if given[x] != wanted.get(x, given[x])), None)
+            if other is not None:
+                raise TypeError(
+                    f"Argument `{argument}` must be one state (use `jax.vmap` for a batch), but "
+                    f"its {other} has shape {given[other]}, not {wanted[other]}."
+                )
             raise TypeError(
                 f"Argument `{argument}` must be a state with {', '.join(words)}, as "
                 f"`machine.at(...)` returns, but got {state!r}."
@@ -433,10 +449,7 @@ def check_start(machine: AbstractMachine, start: State, repeats: bool = True) ->
             'of arrays, `on=("x[0]", "v[0]")`, or `position` and `velocity` of the machine pick '
             "them."
         )
-    for part, x in named_leaves(start):
-        numbers = concrete(x)
-        if numbers is not None and not np.isfinite(numbers).all():
-            raise ValueError(f"Argument `start` must be finite, but its {part} is {numbers}.")
+    check_finite("start", start)
     if isinstance(machine, Scene):
         machine.check_start(start)
     if isinstance(start, eqx.Module):
@@ -453,6 +466,7 @@ def check_start(machine: AbstractMachine, start: State, repeats: bool = True) ->
         if slack is not None and depth > np.max(slack):
             raise ValueError(
                 f"Argument `start` must not lie beyond a stop, but lies {depth:g} beyond stop {i} "
-                f"({stop.side}, gap {gap}). A stop is at +gap on the right, at -gap on the left."
+                f"({stop.name or stop.side}, gap {gap}). A stop is at +gap on the right, at -gap "
+                "on the left."
             )
     check_values(machine, start, repeats)

@@ -93,7 +93,8 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
             ) from None
         if isinstance(error, TypeError):  # it says what must be
             raise
-        raise TypeError(f"{label} cannot be computed: {error}") from error
+        names = " In `force`, `q` has the positions and `v` the velocities." * ("mass" in member)
+        raise TypeError(f"{label} cannot be computed: {error}{names}") from error
     if flow is None:
         raise TypeError(
             f"{label} must return the components of its state, but its `return` is missing."
@@ -590,8 +591,11 @@ def check_parts(machine: AbstractMachine) -> None:
     _check_names(machine)
     with explain_errors(f"`cycle` of a {name}"):
         length = machine.cycle
-    if callable(length):
-        raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
+    if callable(length) or isinstance(length, str | bool | None):
+        got = "a function" if callable(length) else repr(length)
+        raise TypeError(
+            f"`cycle` of a {name} must be a number, or a property that gives one, but is {got}."
+        )
     if jnp.shape(length):
         raise ValueError(
             f"`cycle` of a {name} must be one number, but has shape {jnp.shape(length)}."

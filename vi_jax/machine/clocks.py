@@ -13,7 +13,7 @@ from .._checks import in_range
 from .._messages import count_of
 from .._types import Flag, Machine, Number, Scalar, State
 from .cycles import counts_turns
-from .declared import clock_of, stops_of, switches_of
+from .parts import clock_of, stops_of, switches_of
 
 
 @singledispatch

@@ -1,7 +1,7 @@
 """Ready machines: the paper's scene and its drives, linear machines, and others, each in a file
 that shows how to write one."""
 
-from importlib import import_module
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from .drives import AbstractCrank as AbstractCrank
@@ -41,7 +41,8 @@ READY = {
 def __getattr__(name: str) -> Any:
     if name not in READY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return globals().setdefault(name, getattr(import_module(f".{READY[name]}", __name__), name))
+    module = importlib.import_module(f".{READY[name]}", __name__)
+    return globals().setdefault(name, getattr(module, name))
 
 
 def __dir__() -> list[str]:

@@ -13,8 +13,9 @@ from .forecast import SCENARIOS
 from .grazing import Grazing, Motions, grazing
 from .kinds import KINDS
 from .results import (
-    ORBIT_RESULTS, STABILITY, Orbit, Orbits, MotionSections, check_multipliers, complex_in_words,
-    distance, distinct_among, distinct_orbits, in_one_line, index_of, multipliers_of, stability_of,
+    ORBIT_RESULTS, STABILITY, Orbit, Orbits, MotionSections, check_multipliers, distance,
+    distinct_among, distinct_orbits, in_one_line, index_of, multipliers_in_words, multipliers_of,
+    stability_of,
 )
 from .root_finders import AbstractRootFinder, Gradient, Newton
 from .special import Point

@@ -36,7 +36,7 @@ from .forecast import (
     windows,
 )
 from .local_map import LocalGrazing, graze_at
-from .results import complex_in_words
+from .results import multipliers_in_words
 from .special import Point
 from .tolerances import CORRECTED
 
@@ -263,7 +263,7 @@ class Grazing(Summarized):
     def summary(self) -> str:
         """Describe the stop, the local map, its attractor, and the agreement of the machine."""
         at = in_unit(f"{self.value:.10g}", dict(self.units), self.parameter)
-        values = ", ".join(complex_in_words(z, 6, 1e-9) for z in self.multipliers)
+        values = ", ".join(multipliers_in_words(self.multipliers, 6, 1e-9))
         entries = ", ".join(f"{e:.4g}" for e in self.entries[:6])
         orders = ", ".join(f"{x:g}" for x in self.order)
         lines = [

@@ -475,7 +475,7 @@ def _measured_rotation(
             "Argument `start` must settle on a quasi-periodic motion, but this one repeats after "
             f"{period}: find and follow that orbit."
         )
-    seen = without_angles(jnp.asarray(rows), angles_in(machine, like))
+    seen = without_angles(jnp.asarray(rows), sizes, angles_in(machine, like))
     digits = float(agreement(seen))
     if digits < _DIGITS:
         raise ValueError(
