@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.orbit import boundary_events as module
-from vi_jax.orbit.local_map import NoLocalMapError
+from vi_jax.orbit import codimension_two as module
+from vi_jax.orbit.touch import NoLocalMapError
 
 from grazings import grazing_of
 

@@ -7,7 +7,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
-from vi_jax.orbit.grazing import find_attractors
+from vi_jax.orbit.forecast import find_attractors
 from vi_jax.orbit.local_map import graze_at
 
 from grazings import grazing_of

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from vi_jax.orbit.grazing import find_attractors, scenario_of, windows
+from vi_jax.orbit.forecast import find_attractors, scenario_of, windows
 from vi_jax.orbit.local_map import LocalMap
 
 

@@ -69,7 +69,7 @@ def test_an_interrupted_branch_is_a_branch(monkeypatch):
 
 @pytest.mark.slow
 def test_interrupted_basins_keep_completed_starts(monkeypatch):
-    interrupt_at(monkeypatch, "scans._basins._find_basins", after=0)
+    interrupt_at(monkeypatch, "scans._basins._last_sections", after=0)
     scene = vi.Scene.ideal(frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.2)
     options = {"resolution": 4, "settle": 10, "longest": 4, "progress": False}
     error = interrupted_by(

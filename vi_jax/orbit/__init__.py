@@ -9,11 +9,12 @@ from .cycle_map import CycleMap, cycle_map, map_state
 from .closed_form import ClosedFormOrbits, closed_form_orbits
 from .curve import Boundary, Branch, branch_hits_in_words, column_names
 from .find import find_orbit, is_equilibrium
-from .grazing import SCENARIOS, Grazing, Motions, grazing
+from .forecast import SCENARIOS
+from .grazing import Grazing, Motions, grazing
 from .kinds import KINDS
 from .results import (
     ORBIT_RESULTS, STABILITY, Orbit, Orbits, MotionSections, check_multipliers, distance,
-    distinct_among, distinct_orbits, in_one_line, multipliers_in_words, multipliers_of,
+    distinct_among, distinct_orbits, in_one_line, index_of, multipliers_in_words, multipliers_of,
     stability_of,
 )
 from .root_finders import AbstractRootFinder, Gradient, Newton

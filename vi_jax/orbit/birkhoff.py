@@ -11,9 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Number, Scalar
-
-# A component whose spread is below this share of its size stands still, and has no say: a choice.
-_STILL = 1e-9
+from .tolerances import ROUNDING
 
 # The spread by errors of a method, as a multiple of its `wander`: a choice.
 _WANDERS = 10.0
@@ -56,13 +54,13 @@ def digits_of(difference: Array, spread: Array, mean: Array, wander: Number = 0.
     differ by this, relative to their spread; one that is rounding of the mean counts as that."""
     number = len(mean) // 2
     moves = jnp.tile(_moves(spread[:number], mean[:number], wander), 2)
-    size = spread + _STILL * jnp.abs(mean)
+    size = spread + ROUNDING * jnp.abs(mean)
     share = jnp.max(jnp.where(moves, jnp.abs(difference) / jnp.where(moves, size, 1.0), 0.0))
     return jnp.minimum(-jnp.log10(share + 10.0**-_MOST), _MOST)
 
 
 def _moves(spread: Array, size: Array, wander: Number) -> Array:
-    still = jnp.maximum(_STILL, _WANDERS * jnp.asarray(wander, spread.dtype))
+    still = jnp.maximum(ROUNDING, _WANDERS * jnp.asarray(wander, spread.dtype))
     return spread > still * jnp.maximum(jnp.abs(size), 1.0)
 
 

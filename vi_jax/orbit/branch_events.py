@@ -26,38 +26,21 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
 
-from .._types import Scalar, Vector
-from ..machine import AbstractMachine, jumps_on_section, section_in
 from .conditions import HeldMultiplier, bifurcation_tests, in_one_parameter, rates_at
-from .corrector import (
-    SPACING,
-    Step,
-    advance,
-    crossing,
-    dip_of,
-    distance_along,
-    observe,
-    on_host,
-    orbit_of,
-)
+from .corrector import Step, advance, distance_along, orbit_of
 from .edit_events import (
-    ALIKE,
-    ROUNDED,
     half_difference,
     locate_origin,
     may_be_symmetric,
     may_repeat,
     without_events,
 )
-from .equations import ROUNDING, Shooting, Unknowns
-from .flight import LANDS, LEAVES, section_of
+from .equations import Shooting
+from .flight import LANDS, LEAVES
 from .flight import Event as MotionEvent
+from .hopf import hopf_between, size_of_cycle
 from .kinds import (
     CROSSING,
     DOUBLING,
@@ -73,9 +56,11 @@ from .kinds import (
     TURNS,
     WATCHED,
 )
-from .results import NEUTRAL, Orbit
+from .locate import SPACING, crossing, dip_of
+from .results import Orbit
 from .sliding import change_at, locate_change
 from .special import Point, further_of, point_at
+from .tolerances import ALIKE, LOCATED, ROUNDING, SAME
 from .walk import Ending, Event, Table, bound_rows
 from .words import coincidence_in_words, grazing_in_words, place_in_words
 
@@ -83,12 +68,6 @@ from .words import coincidence_in_words, grazing_in_words, place_in_words
 
 # Events before the place where a branch begins are located on this share of the way.
 _SHORT = 0.999
-
-# The same share before a lost impact, where the monodromy matrix has a pole.
-_BEFORE_POLE = 1 - 1e-6
-
-# An autonomous motion with this share of another's size is an equilibrium.
-_AT_REST = 1e-6
 
 # A motion with this share of its neighbours' size is about to shrink to rest.
 _SHRINKS = 1e-2
@@ -120,14 +99,6 @@ _MOST_PARABOLAS = 3
 # Cosine of the angle between tangents of one branch so close to each other: a choice.
 _SAME_DIRECTION = 0.99
 
-# A quantity passes zero if it is less than this share of its neighbours; otherwise it jumps.
-_ZERO = 1e-6
-
-# A quantity that changes less than this along the branch (relative, in the norm of the scaled
-# unknowns) changes by rounding only: a choice. The greatest position of a body that hits a stop,
-# the stop's place, changes by some 1e-16.
-_CHANGES = 1e-9
-
 # An extremum is a corner if the rate there exceeds this share of the rates on both sides: a choice,
 # far above the remainder at a place that is located to rounding.
 _CORNER = 1e-4
@@ -154,8 +125,10 @@ class MotionTable(Table):
         new = super().advance(x, tangent, length)
         if not self.problem.autonomous or not bool(new.good):
             return new
-        self.size = self.size or _size_of(self.problem, x)
-        return new._replace(good=np.asarray(_size_of(self.problem, new.x) > _AT_REST * self.size))
+        self.size = self.size or size_of_cycle(self.problem, x)
+        return new._replace(
+            good=np.asarray(size_of_cycle(self.problem, new.x) > LOCATED * self.size)
+        )
 
     def event_rows(self, here: Step, new: Step) -> list[Event]:
         rows = bound_rows(self)
@@ -202,7 +175,7 @@ class MotionTable(Table):
             approach = lambda step, i=i: float(step.observed.approach[i])
             if event.cycle is not None and not self.problem.conditions:
                 hopf_ending = lambda at: self._end_with(HOPF, at, KINDS[HOPF].detail, 0)
-                yield Event(approach, hopf_ending, partial(_hopf_between, self.problem))
+                yield Event(approach, hopf_ending, partial(hopf_between, self.problem))
             yield Event(approach, partial(self._ending, here, impact=i))
         # Ignore rounding for events that always coincide.
         rounding = ROUNDING * self.problem.radian
@@ -243,9 +216,9 @@ class MotionTable(Table):
         detail = grazing_in_words(self.problem, at, impact)
         if impact is None:
             return self._end_with(GRAZING, at, detail)
-        # A multiplier goes to infinity there and returns from the other side. Its sign is that of
-        # rounding, and the tests for bifurcations may have changed sign twice.
-        before_pole = self._partway(here, at, _BEFORE_POLE)
+        # At a lost impact a multiplier goes to infinity and returns from the other side. Its sign
+        # is that of rounding, and the tests for bifurcations may have changed sign twice.
+        before_pole = self._partway(here, at, 1 - LOCATED)
         before_pole = before_pole if bool(before_pole.good) else at
         M, values = before_pole.observed.monodromy, before_pole.observed.multipliers
         at = at._replace(observed=at.observed._replace(monodromy=M, multipliers=values))
@@ -256,7 +229,7 @@ class MotionTable(Table):
         other. Beyond, the same motions repeat, half a period later or mirrored."""
         for kind, differ in ((DOUBLING, self._half_difference), (SYMMETRY, self.image_difference)):
             begin = differ(here)
-            if np.linalg.norm(begin) < ROUNDED:
+            if np.linalg.norm(begin) < SAME:
                 continue
 
             def ending(at: Step, kind=kind, differ=differ) -> Ending | None:
@@ -279,7 +252,7 @@ class MotionTable(Table):
     def stall_end(self, steps: list[Step]) -> Ending:
         """Return the end at the motion of half the period, if the branch begins at it close by."""
         size = np.linalg.norm(self._half_difference(steps[-1]))
-        found = self._find_origin(steps[-1]) if size > ROUNDED else None
+        found = self._find_origin(steps[-1]) if size > SAME else None
         return super().stall_end(steps) if found is None else Ending(found[0], DOUBLING, found[1])
 
     def _find_origin(self, at: Step) -> tuple[Step, Point] | None:
@@ -313,7 +286,7 @@ class MotionTable(Table):
         self._last_numbers = last.x, self._numbers(last)
         for (kind, name), (value, begin) in before.items():
             other, end = self._last_numbers[1][kind, name]
-            steep, least = max(abs(begin), abs(end)), _CHANGES * max(abs(value), abs(other))
+            steep, least = max(abs(begin), abs(end)), ROUNDING * max(abs(value), abs(other))
             if not begin * end < 0 or (kind == EXTREMUM and steep <= least):
                 continue
             at = self.locate_zero(here, last, lambda s, k=(kind, name): self._numbers(s)[k][1])
@@ -321,7 +294,7 @@ class MotionTable(Table):
                 continue
             value_at_zero, rate = self._numbers(at)[kind, name]
             if kind == WATCHED:
-                is_real, detail = abs(value_at_zero) <= _ZERO * steep, f"{name} passes zero"
+                is_real, detail = abs(value_at_zero) <= LOCATED * steep, f"{name} passes zero"
             else:
                 sense, extreme = (1, "largest") if begin > 0 else (-1, "least")
                 # Otherwise it has a pole, as a multiplier at a grazing.
@@ -454,7 +427,7 @@ class MotionTable(Table):
     def _shrinks_to_rest(self, here: Step, at: Step, last: Step) -> bool:
         if not self.problem.autonomous:
             return False
-        size, *neighbours = (_size_of(self.problem, step.x) for step in (at, here, last))
+        size, *neighbours = (size_of_cycle(self.problem, step.x) for step in (at, here, last))
         return size < _SHRINKS * max(neighbours)
 
     def _begins_at(self, here: Step, at: Step) -> bool:
@@ -463,7 +436,7 @@ class MotionTable(Table):
         if halves.size and np.linalg.norm(halves) < ALIKE:
             return True
         before = np.linalg.norm(self.image_difference(here))
-        return bool(images.size and np.linalg.norm(images) < ALIKE and before > ROUNDED)
+        return bool(images.size and np.linalg.norm(images) < ALIKE and before > SAME)
 
     def _crossing(self, here: Step, at: Step, kind: str) -> Step:
         def admits(step: Step, length: float) -> bool:
@@ -507,7 +480,7 @@ def _changed_tests(here: Step, last: Step, *, held: bool) -> list[str]:
     before, after = bifurcation_tests(here), bifurcation_tests(last)
     changed = [kind for kind in before if before[kind] * after[kind] < 0]
     # Without damping a pair stays on the unit circle, to rounding of either sign.
-    if TORUS in changed and max(abs(before[TORUS]), abs(after[TORUS])) < NEUTRAL:
+    if TORUS in changed and max(abs(before[TORUS]), abs(after[TORUS])) < ROUNDING:
         changed.remove(TORUS)
     if held and FOLD in changed:
         changed.remove(FOLD)
@@ -530,7 +503,7 @@ def _outside_count(step: Step) -> int | None:
     """Return the number of multipliers outside the unit circle; `None` if unknown or one is on
     it."""
     sizes = np.abs(step.observed.multipliers)
-    if not np.isfinite(sizes).all() or (np.abs(sizes - 1) < NEUTRAL).any():
+    if not np.isfinite(sizes).all() or (np.abs(sizes - 1) < ROUNDING).any():
         return None
     return int(np.sum(sizes > 1))
 
@@ -538,132 +511,3 @@ def _outside_count(step: Step) -> int | None:
 def _turns_back(here: Step, at: Step, last: Step, scale: np.ndarray) -> bool:
     sides = [(float(at.x[-1]) - float(step.x[-1])) / scale[-1] for step in (here, last)]
     return bool(sides[0] * sides[1] > 0 and min(map(abs, sides)) > 1e-12)
-
-
-# The cycle of an autonomous machine may shrink onto an equilibrium. Its equations are singular
-# there: the equilibrium solves them with every period, and, if the section is a velocity, for every
-# value of the parameter. So the equations of the equilibrium are solved instead, with the parameter
-# at which two of its eigenvalues are imaginary.
-
-# Size of the motion that represents the branch there, as a share of the one before it.
-_TINY = 1e-5
-
-# Largest relative difference of an eigenvalue's period from that of the last motion.
-_ALIKE_PERIOD = 0.2
-
-# Zero, relative to the scale of comparison.
-_VANISHES = 1e-9
-
-# Tolerance of a multiplier 1.
-_ONE = 1e-6
-
-
-def _rate(problem: Shooting, machine: AbstractMachine, u: Vector) -> Vector:
-    smooth = problem.flight(machine, 0).smooth
-    return ravel_pytree(smooth.field(jnp.zeros((), u.dtype), problem.unravel(u)))[0]
-
-
-@on_host
-def _section_rate(problem: Shooting, x: Vector) -> tuple[Vector, Scalar]:
-    """Return the rate of a motion on its section, in the sizes of the state, and its period."""
-    machine = problem.at(x)
-    u = problem.after(machine, 0, jnp.zeros((), x.dtype), problem.parts(x)[1][0])
-    return _rate(problem, machine, u) / problem.sizes[1:], problem.period(x)
-
-
-def _size_of(problem: Shooting, x: Unknowns) -> float:
-    """Return the distance that an autonomous motion would move in its period at its first rate, in
-    the sizes of the state."""
-    rate, period = _section_rate(problem, x)
-    return float(np.linalg.norm(rate) * period)
-
-
-def _hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
-    """Return a tiny motion about the equilibrium with eigenvalues ±iω onto which the cycle shrinks
-    between two points; `None` unless it has a multiplier 1."""
-    machine = problem.machine
-    if problem.events != (section_of(machine, 0),) or jumps_on_section(machine):
-        return None
-    rates = [_section_rate(problem, step.x)[0] for step in (here, new)]
-    if np.dot(*rates) >= 0:
-        return None  # beyond an equilibrium the motion is reversed
-    size, other = np.linalg.norm(rates, axis=1)
-    guess = here.x + size / (size + other) * (new.x - here.x)
-    found = _hopf_equilibrium(problem, guess)
-    if found is None:
-        return None
-    moved, step = ((a - b) / problem.scale for a, b in ((found[0], guess), (new.x, here.x)))
-    if np.linalg.norm(moved) > np.linalg.norm(step):
-        return None
-    return _motion_about(problem, here, *found)
-
-
-@on_host
-def _linearise(problem: Shooting, x: Vector) -> tuple[Array, Scalar, Vector]:
-    """Return the field's derivative in the state of `x`, the section there and its derivative."""
-    machine, u = problem.at(x), problem.parts(x)[1][0]
-    section, slope = jax.value_and_grad(lambda u: section_in(machine, problem.unravel(u)))(u)
-    return jax.jacfwd(partial(_rate, problem, machine))(u), section, slope
-
-
-@on_host
-def _residual(problem: Shooting, y: Vector, scale: Vector, like: Array) -> tuple[Vector, Array]:
-    """Return the residual of the equations of an equilibrium u with an eigenvector v to iω, and its
-    derivative. The unknowns (u, p, ω, Re v, Im v) are y·scale; `like` fixes v in length and
-    phase."""
-    n = problem.states
-
-    def residual(y):
-        unknowns, (c, d) = y * scale, y[n + 2 :].reshape(2, n)
-        u, omega, (a, b) = unknowns[:n], unknowns[n + 1], unknowns[n + 2 :].reshape(2, n)
-        field = partial(_rate, problem, problem.at(unknowns[: n + 1]))
-        matrix = jax.jacfwd(field)(u)
-        rates = jnp.stack([field(u), matrix @ a + omega * b, matrix @ b - omega * a])
-        normalisation = jnp.stack([like[0] @ c + like[1] @ d - 1, like[0] @ d - like[1] @ c])
-        return jnp.concatenate([(rates / (scale[:n] * scale[n + 1])).ravel(), normalisation])
-
-    return residual(y), jax.jacfwd(residual)(y)
-
-
-def _hopf_equilibrium(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the equilibrium near a guess with imaginary eigenvalues, and an eigenvector."""
-    n, omega, matrix = problem.states, 2 * np.pi / guess[0], _linearise(problem, guess)[0]
-    if not np.isfinite(matrix).all():
-        return None
-    sizes = problem.scale[1 : n + 1]
-    scale = np.concatenate([problem.scale[1:], [omega], sizes, sizes])
-    values, vectors = np.linalg.eig(matrix * sizes / sizes[:, None])
-    nearest = vectors[:, np.argmin(np.abs(values - 1j * omega))]
-    like = np.stack([np.real(nearest), np.imag(nearest)])
-    y, size = np.concatenate([guess[1:] / scale[: n + 1], [1.0], like.ravel()]), np.inf
-    for _ in range(20):
-        residual, jacobian = _residual(problem, y, scale, like)
-        if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
-            return None
-        step = np.linalg.lstsq(jacobian, residual)[0]  # the smallest if a component is neutral
-        y, size = y - step, np.abs(step).max()
-        if size <= 1e-14:
-            break
-    if not size < _VANISHES or abs(y[n + 1] - 1) >= _ALIKE_PERIOD:
-        return None
-    y = y * scale
-    vector = y[n + 2 : 2 * n + 2] + 1j * y[2 * n + 2 :]
-    return np.append(2 * np.pi / y[n + 1], y[: n + 1]), vector / np.linalg.norm(vector / sizes)
-
-
-def _motion_about(problem: Shooting, here: Step, x: np.ndarray, vector: np.ndarray) -> Step | None:
-    """Return a tiny motion about an equilibrium, where it passes the section."""
-    _, section, slope = _linearise(problem, x)
-    sizes = problem.scale[1:-1]
-    section_part, steep = slope @ vector, np.linalg.norm(slope * sizes)
-    distance = np.linalg.norm((here.x[1:-1] - x[1:-1]) / sizes)
-    if abs(section_part) <= _VANISHES * steep or abs(section) > _VANISHES * steep * distance:
-        return None  # the motion does not cross the section
-    # The phase of the linear motion in which the section rises through zero.
-    direction = (vector * (-1j * np.conj(section_part))).real
-    direction /= np.linalg.norm(direction / sizes)
-    direction = np.concatenate([[0.0], direction, [0.0]])
-    x = x + _TINY * distance * direction
-    tangent = -direction / problem.scale
-    found = here._replace(x=x, tangent=tangent, observed=observe(problem, x))
-    return found if np.abs(found.observed.multipliers - 1).min() < _ONE else None

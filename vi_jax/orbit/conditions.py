@@ -25,12 +25,9 @@ from .kinds import CROSSING, DOUBLING, FOLD, KINDS, REST, SLIDING, TORUS, TOUCHI
 from .rest import Chatter
 from .results import compound
 from .sliding import excess_rates
+from .tolerances import LOCATED
 
 _SECTION = "section_"
-
-# A second parameter separates crossing branches if its derivative has a larger component along the
-# left null vector than this share of the largest singular value: a choice, above a point's error.
-_SEPARATES = 1e-6
 
 
 def known_names(problem: Shooting) -> tuple[str, ...]:
@@ -213,7 +210,7 @@ def replacement_at(problem: Shooting, x: np.ndarray) -> Replacement | None:
     Jacobian without the parameters' columns; `None` if the second parameter separates them."""
     jacobian = jacobian_at(problem, x)
     left, sizes, right = np.linalg.svd(jacobian[:, :-2])
-    if abs(left[:, -1] @ jacobian[:, -2]) > _SEPARATES * sizes[0]:
+    if abs(left[:, -1] @ jacobian[:, -2]) > LOCATED * sizes[0]:
         return None
     return Replacement(jnp.asarray(left[:, -1]), jnp.asarray(right[-1] * problem.scale[:-2]))
 

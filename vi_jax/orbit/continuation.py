@@ -36,15 +36,13 @@ from .from_orbit import (
     with_sizes,
 )
 from .kinds import CROSSING, FOLD, FOLLOWED, SLIDING, SYMMETRY, TOUCHING, with_article
-from .results import NEUTRAL, ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
+from .results import ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
 from .sliding import change_at, without_part
 from .special import Point
+from .tolerances import ALIKE, ROUNDING
 from .walk import check_walk, follow_both_ways, rescaled
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
-
-# The corrector moves an orbit of the cycle map by less than this (scaled): a choice.
-_SAME = 1e-3
 
 
 def continue_orbit(
@@ -113,16 +111,12 @@ def continue_orbit(
     bounds = interval("bounds", bounds)
     value = float(leaf(orbit.machine, parameter))
     check_parameter(orbit.machine, parameter, value, bounds, "orbit")
-    if int(orbit.rests) > 0 or (may_rest(orbit.machine) and lies_on_a_stop(orbit)):
-        problem, x = resting_problem_of(orbit, parameter, bounds, method)
-    else:
-        problem, x = problem_of(orbit, parameter, bounds, method)
+    rests = int(orbit.rests) > 0 or (may_rest(orbit.machine) and lies_on_a_stop(orbit))
+    equations = resting_problem_of if rests else problem_of
+    problem, x = equations(orbit, parameter, bounds, method)
     sought, watched = _check_names("extrema", extrema, problem), _check_watched(watch, orbit)
     problem, x, ranges = _extend(problem, x, free, fixed, bounds, np.asarray(orbit.multipliers))
-    start, old_scale = _first_point(problem, x, orbit), problem.scale
-    problem = with_sizes(problem, start.x, start.observed.largest)
-    (start,) = rescaled([start], old_scale, problem.scale)
-    start = advance(problem, start.x, start.tangent, 0.0)
+    problem, start = _first_point(problem, x, orbit)
     return follow_both_ways(
         lambda: MotionTable(problem, ranges, sought, watched),
         start,
@@ -229,7 +223,15 @@ def _with_widths(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Sh
     return dataclasses.replace(problem, widths=widths)
 
 
-def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
+def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> tuple[Shooting, Step]:
+    """Return the equations with the sizes of the orbit's motion, and their solution there."""
+    start, old_scale = _refined_point(problem, x, orbit), problem.scale
+    problem = with_sizes(problem, start.x, start.observed.largest)
+    (start,) = rescaled([start], old_scale, problem.scale)
+    return problem, advance(problem, start.x, start.tangent, 0.0)
+
+
+def _refined_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
     """Refine the orbit as a solution of its equations from event to event, at its parameter. At a
     fold it is refined across the branch instead, which needs another compiled program."""
     start, distance = _refine(problem, x, np.eye(problem.size)[-1])
@@ -241,16 +243,16 @@ def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
             f"{float(start.size):.2g}). Choose values closer to the orbit's, or other free "
             "parameters: an extreme on a stop, say, does not depend on any."
         )
-    if distance > _SAME:
+    if distance > ALIKE:
         start, distance = _refine(problem, x, tangent_at(problem, x))
-    if distance > _SAME and float(np.abs(np.asarray(orbit.multipliers) - 1).min()) < NEUTRAL:
+    if distance > ALIKE and float(np.abs(np.asarray(orbit.multipliers) - 1).min()) < ROUNDING:
         raise ValueError(
             "Argument `orbit` has a multiplier of exactly 1: branches cross there, or a component "
             "of its state is neutral, such as a free position, a counter, or the place at which "
             "dry friction holds a body. Leave such a component out of the state to follow the "
             "orbit."
         )
-    if distance > _SAME:
+    if distance > ALIKE:
         raise ValueError(
             "Argument `orbit` could not be refined from impact to impact (last correction "
             f"{max(distance, float(start.size)):.2g}): branches cross there, its section lies on "

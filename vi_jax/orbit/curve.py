@@ -24,13 +24,15 @@ from ..machine import (
     units_of,
     with_units,
 )
-from .boundary_events import cosine_of, points_of
+from .codimension_two import cosine_of, points_of
 from .conditions import Special, held_in_words
-from .corrector import Hits, Step, energies_of, hits_of, locate_zero, orbit_of, sections_at
+from .corrector import Hits, Step, energies_of, hits_of, orbit_of, sections_at
 from .equations import Observed, Shooting
 from .kinds import TORUS
-from .results import NEUTRAL, Orbit, stability_of
+from .locate import locate_zero
+from .results import Orbit, stability_of
 from .special import Point
+from .tolerances import EXACT, ROUNDING
 
 # Names of the numbers at each point of every curve.
 COLUMNS = (
@@ -71,10 +73,6 @@ def _numbers(found: object) -> dict[str, np.ndarray]:
                 f"{name!r} is {named[name]!r}."
             )
     return numbers
-
-
-# A point within this distance of a value (in the parameter's scale) lies at it.
-_ROUNDING = 1e-12
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
@@ -181,7 +179,7 @@ class Curve(abc.ABC):
     @property
     def stable(self) -> np.ndarray:
         """True at each point if all multipliers lie inside the unit circle, by more than 1e-9."""
-        return self.multiplier < 1 - NEUTRAL
+        return self.multiplier < 1 - ROUNDING
 
     @property
     def admissible(self) -> np.ndarray:
@@ -301,7 +299,7 @@ class Curve(abc.ABC):
         def difference(step: Step) -> float:
             # Points at a value, such as a bound, are at it to rounding.
             offset = float(step.x[-1]) - value
-            return offset if abs(offset) > _ROUNDING * float(self.scale[-1]) else 0.0
+            return offset if abs(offset) > EXACT * float(self.scale[-1]) else 0.0
 
         solutions = []
         following: list[Step | None] = [*self.steps[1:], None]

@@ -14,22 +14,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..machine import AbstractMachine, in_rows, nearest_images, stops_of
-from .corrector import (
-    Step,
-    advance,
-    find_zero_near,
-    observe,
-    on_host,
-    sections_at,
-    state_at,
-    tangent_at,
-)
-from .equations import ROUNDING, Shooting
+from .corrector import Step, advance, observe, on_host, sections_at, state_at, tangent_at
+from .equations import Shooting
 from .flight import Event, section_of
-
-# Halves of a period are equal, or images of each other, if they differ by less than the first; by
-# less than the second, up to rounding. Choices.
-ALIKE, ROUNDED = 1e-3, 1e-7
+from .locate import find_zero_near
+from .tolerances import ROUNDING, SAME
 
 
 def may_be_symmetric(problem: Shooting, machines: Iterable[AbstractMachine]) -> bool:
@@ -168,11 +157,6 @@ def admissible_near(problem: Shooting, x: np.ndarray, distance: float) -> Step |
     return None
 
 
-# Sections of one motion are the same if they differ by less than this (in the state's sizes): a
-# choice, far above the error of a located point, far below the difference of distinct motions.
-_SAME = 1e-7
-
-
 def with_sections(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
     """Return the equations of a motion with its sections among the events, and their unknowns."""
     if not old.omits_sections:
@@ -214,7 +198,7 @@ def with_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarra
     for cycles in range(1, old.cycles):
         repetitions, remainder = divmod(old.cycles, cycles)
         difference = np.abs(np.roll(rows, -cycles, axis=0) - rows) / np.asarray(old.sizes)[1:]
-        if remainder or difference.max() >= _SAME or len(old.events) % repetitions:
+        if remainder or difference.max() >= SAME or len(old.events) % repetitions:
             continue
         if repeats_from(old, len(old.events) // repetitions):
             break

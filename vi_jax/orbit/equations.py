@@ -48,14 +48,8 @@ from ..machine import (
 from .flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
 from .rest import Chatter, escape_margin, last_hop, remaining
 from .results import multipliers_of
+from .tolerances import LOCATED, ROUNDING
 from .turns import Nearest, Path, pull_of, turns_of
-
-# A distance or a speed is zero within this share of a motion's largest: a choice, 100 tolerances.
-ROUNDING = 1e-9
-
-# An event with a lower speed of approach (in its unit) is lost, and a stop with a smaller distance
-# is touched: a choice. The corrector leaves up to 5e-8 at the release from a soft stop that grazes.
-_GRAZES = 1e-6
 
 # Newton steps from the begin of a step to the passage of an angle within it. Four reach rounding if
 # the speed changes by less than half in a step.
@@ -112,12 +106,12 @@ class Observed(NamedTuple):
     @property
     def lost(self) -> np.ndarray:
         """True for each event that grazes; host-side."""
-        return np.abs(np.asarray(self.approach / self.units)) < _GRAZES
+        return np.abs(np.asarray(self.approach / self.units)) < LOCATED
 
     @property
     def touches(self) -> bool:
         """True if the motion turns on a stop that it does not hit; host-side."""
-        return abs(self.relative_clearance) <= _GRAZES
+        return abs(self.relative_clearance) <= LOCATED
 
     @property
     def relative_clearance(self) -> float:
@@ -714,13 +708,7 @@ class Shooting(eqx.Module):
         event. The jump is differentiated where the body is, without moving it onto its stop
         (`jump_of`): ∇g accounts for the change of the event's time.
         """
-        old, new = (
-            self.flight(machine, leg - 1).smooth,
-            self.flight_after_event(machine, leg).smooth,
-        )
-
-        def field(machine, u):
-            return ravel_pytree(machine.field(s, self.unravel(u)))[0]
+        old, new = self.flight(machine, leg - 1), self.flight_after_event(machine, leg)
 
         def jumped(event, u):
             if event.use == LEAVES:
@@ -732,7 +720,7 @@ class Shooting(eqx.Module):
             return self._for_event(leg, jumped, u)
 
         jacobian = jax.jacfwd(reset)(u)
-        before, after = field(old, u), field(new, reset(u))
+        before, after = old.rate(s, u), new.rate(s, reset(u))
         if self.autonomous:
             # The clock restarts there, so a perturbation along the motion vanishes.
             clock_continues = [float(i > 0 and not event.of(machine).ends_cycle)

@@ -108,6 +108,10 @@ class Flight(eqx.Module):
     def unravel(self, u: Vector) -> State:
         return ravel_pytree(self.like)[1](u)
 
+    def rate(self, s: Scalar, u: Vector) -> Vector:
+        """Return f(s, u)."""
+        return ravel_pytree(self.smooth.field(s, self.unravel(u)))[0]
+
     def step(
         self, s0: Scalar, s1: Scalar, u: Vector, integrals: Integrals
     ) -> tuple[Vector, Integrals]:

@@ -67,6 +67,7 @@ from .corrector import on_host, step_error
 from .equations import Shooting, Unknowns
 from .flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
 from .results import Orbit
+from .tolerances import CORRECTED, LISTED, LOCATED, ROUNDING
 
 
 def has_fixed_steps(method: AbstractMethod) -> bool:
@@ -129,27 +130,19 @@ def _fewest_steps(method: AbstractMethod, machine: AbstractMachine, like: State)
     return machine.cycle / method.longest(machine, jnp.zeros(()), like)
 
 
-# Most events of a cycle that are followed, with switches or a section of the machine: a choice.
-LISTED = 32
-
-# Steps are doubled until the end of a flight changes by less than the first number (relative to the
-# motion's size; the corrector's tolerance). The second is their largest number: a choice.
-_SETTLED, _MOST = 1e-11, 4096
+# Steps are doubled until the end of a flight changes by less than `CORRECTED`, or up to this
+# number: a choice.
+_MOST = 4096
 
 # Doubling the steps changes the states of a point of a curve by less than this. It is above the
 # corrector's tolerance and below the promised accuracy of special points.
 COARSE = 1e-10
 
 
-# Events this close are simultaneous, relative to the last one's clock. A guard must be this close
-# to zero, relative to its change over the sizes of the state. Choices.
-_SAME_INSTANT, _OFF_ZERO = 1e-9, 1e-6
-
-
 # A component of the state below the first share of its expected size at events, or below the second
 # along the whole motion, gets that size. Both are choices; the second is above the remainder of a
-# component that decays to zero. If all are below the third, at rest, the size is 1.
-_SMALL, _NOTHING, _REST = 1e-3, 1e-10, 1e-9
+# component that decays to zero. If all are zero to rounding, at rest, the size is 1.
+_SMALL, _NOTHING = 1e-3, 1e-10
 
 
 # The clock of an event, counted from the section.
@@ -224,7 +217,7 @@ def equations_along(
         before = states
         blank = dataclasses.replace(blank, steps=2 * blank.steps)
         states, modes = _follow_events(blank, state, found, period)
-        if np.max(np.abs(states - before) / _sizes(blank, states)) < _SETTLED:
+        if np.max(np.abs(states - before) / _sizes(blank, states)) < CORRECTED:
             break  # keep the finer one: flights may need more steps along the branch
         blank = dataclasses.replace(blank, method=blank.method.tighter())
     problem = dataclasses.replace(blank, events=events, modes=modes)
@@ -264,7 +257,7 @@ def _sizes(problem: Shooting, states: np.ndarray, small: float = _SMALL) -> np.n
     that is small here may be larger elsewhere. Its size is then that which its rates determine,
     else that of the largest component, at most 1."""
     maxima = np.abs(np.atleast_2d(states)).max(axis=0)
-    largest = maxima.max() if maxima.max() > _REST else 1.0
+    largest = maxima.max() if maxima.max() > ROUNDING else 1.0
     if (maxima > small * largest).all():
         return 0.5 * maxima
     expected = sizes_on_host(problem.machine, problem.like, states)
@@ -280,13 +273,13 @@ def _check_instants(
     machine, previous = blank.machine, 0.0
     span = max((abs(place) for place, _ in found), default=0.0)
     for i, (place, event) in enumerate(found):
-        if abs(place - previous) <= _SAME_INSTANT * span and event.cycle is None:
+        if abs(place - previous) <= ROUNDING * span and event.cycle is None:
             state, modes = blank.unravel(jnp.asarray(states[i])), in_flight[i - 1]
             modes = tuple(jnp.asarray(mode) for mode in modes)
             before = Flight(machine, modes, blank.method, blank.like)
             guard = partial(guard_at, before, event, jnp.asarray(place))
             sizes = blank.unravel(jnp.asarray(np.abs(states).max(axis=0)))
-            if abs(float(guard(state))) > _OFF_ZERO * (float(size_of(guard, state, sizes)) or 1.0):
+            if abs(float(guard(state))) > LOCATED * (float(size_of(guard, state, sizes)) or 1.0):
                 raise ValueError(
                     f"Argument `orbit` must have no event whose guard jumps, but that of "
                     f"{event.name_on(machine)} does, with another event or as a cycle begins. "
@@ -313,7 +306,7 @@ def with_finer_steps(problem: Shooting, x: Unknowns, error: float) -> Shooting |
         if not error < 0.5 * before:  # rounding
             break
         refined = problem
-        if error < _SETTLED:
+        if error < CORRECTED:
             break
     return refined
 
@@ -482,9 +475,6 @@ _SHORT = 5
 
 ADVICE = "Find such motions value by value: `find_orbit` with another parameter, from this motion."
 
-# A body this close to its stop (relative to the motion, see `distance`) is on it: a choice.
-_ON = 1e-9
-
 
 def resting_problem_of(
     orbit: Orbit, parameter: str, bounds: tuple[float, float], method: MethodLike
@@ -597,7 +587,7 @@ def _contact(machine: AbstractMachine, state: Any, events: tuple[Event, ...]) ->
     for i, stop in enumerate(stops):
         position = machine.coordinates[stop.coordinate].position
         place, unit = position(state), float(size_of(position, state, sizes))
-        on_stop = abs(float(stop.beyond(place))) < _ON * (unit + abs(float(place)))
+        on_stop = abs(float(stop.beyond(place))) < ROUNDING * (unit + abs(float(place)))
         if on_stop and stop.coordinate not in moves:
             contact[stop.coordinate] = 1.0 + i
     return tuple(contact)

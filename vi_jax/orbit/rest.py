@@ -21,19 +21,15 @@ from .._types import Flag, Scalar, State, Vector
 from ..flow import TIME, Integrals, Rates, force_rate, guard_rates, rounding_bounds
 from ..machine import RigidStop, push_of, stops_of
 from .flight import Flight, force_on
+from .tolerances import LOCATED, ROUNDING
 
 # Most hops of a chatter, and most corrections of the landing of each: choices. With restitution
 # 0.95 a rebound has 1e-4 of the first speed after 180 hops.
 _HOPS, _CORRECTIONS = 400, 7
 
-# A landing is corrected until a correction is below this share of the hop. The next one would be
-# its square; the error of the derivatives is of the order of the last one.
-_CLOSE = 1e-9
-
-# A landing is found if the remaining distance is below this share of the hop's height. That
-# distance must exceed so many roundings of the stop's place, and those of the body's. Both are
-# choices.
-_LANDED, _ROUNDINGS = 1e-6, 10
+# The remaining distance at a landing must exceed so many roundings of the stop's place, and those
+# of the body's: a choice.
+_ROUNDINGS = 10
 
 # A hop is the last one if its rebound is slower than this share of the fastest. Its error of third
 # order is then rounding, and its landing is accurate to a millionth of its duration.
@@ -74,7 +70,7 @@ def last_hop(free: Flight, number: int, begin: Chatter, *, until: Scalar, steps:
         # A distance that is a function of several numbers has the rounding of all of them.
         state = free.unravel(hops.u)
         rounding += rounding_bounds(free.machine, stop.coordinate, state, 0.0)[0]
-        fast = (-here.v > _SLOW * fastest) & (here.v**2 > rounding / _LANDED * jnp.abs(here.a))
+        fast = (-here.v > _SLOW * fastest) & (here.v**2 > rounding / LOCATED * jnp.abs(here.a))
         return ~hops.is_over & (fast | (here.a < 0)) & (count < _HOPS)
 
     def hop(carry: tuple[Chatter, Scalar, int]) -> tuple[Chatter, Scalar, int]:
@@ -83,7 +79,8 @@ def last_hop(free: Flight, number: int, begin: Chatter, *, until: Scalar, steps:
 
         def inexact(carry):
             length, move, count = carry
-            close = jnp.abs(move) <= _CLOSE * jnp.abs(length)
+            # The next one would be its square; the error of the derivatives is of its order.
+            close = jnp.abs(move) <= ROUNDING * jnp.abs(length)
             return ~hops.is_over & ~close & (count < _CORRECTIONS)
 
         def correct(carry):
@@ -98,7 +95,7 @@ def last_hop(free: Flight, number: int, begin: Chatter, *, until: Scalar, steps:
         integrals = {name: x + added[name] for name, x in hops.integrals.items()}
         s, here = hops.s + length, rates(hops.s + length, u)
         height = jnp.abs(length * rates(hops.s, hops.u).v)
-        lands = (length > 0) & (here.v > 0) & (jnp.abs(here.x) < _LANDED * height) & (s < until)
+        lands = (length > 0) & (here.v > 0) & (jnp.abs(here.x) < LOCATED * height) & (s < until)
         rebound, _ = stop.after(free.machine, s, free.unravel(u), *free.modes)
         impact = Chatter(s, ravel_pytree(rebound)[0], integrals, ~lands)
         unchanged = hops._replace(is_over=~lands)

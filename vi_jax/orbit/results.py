@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 
 from .._checks import (
     array_module,
@@ -59,6 +59,7 @@ from ..machine import (
     without_history,
     without_modes,
 )
+from .tolerances import ROUNDING
 
 
 class STABILITY(NamedEnumeration):
@@ -71,9 +72,6 @@ class STABILITY(NamedEnumeration):
     neutral = "neutral: neither stable nor unstable to rounding, a multiplier has modulus 1"
     unknown = "without multipliers"
 
-
-# A modulus is 1 within this, in double precision: a choice, ten times `Newton`'s tolerance.
-NEUTRAL = 1e-9
 
 # A multiplier below so many roundings of the largest one, or of 1, is printed as 0: a choice.
 _ROUNDINGS = 16.0
@@ -129,14 +127,14 @@ def stability_of(multipliers: Complex[Array | np.ndarray, "*batch n"]) -> STABIL
     place = array.argmax(abs(multipliers), axis=-1, keepdims=True)
     largest = array.take_along_axis(multipliers, place, axis=-1)[..., 0]
     size = abs(largest)
-    real = abs(largest.imag) <= NEUTRAL * size
+    real = abs(largest.imag) <= ROUNDING * size
     unstable_kind = STABILITY.where(
         real & (largest.real > 0),
         STABILITY.fold,
         STABILITY.where(real, STABILITY.period_doubling, STABILITY.neimark_sacker),
     )
     verdict = STABILITY.where(size < 1, STABILITY.stable, unstable_kind)
-    rounding = max(NEUTRAL, 100 * float(jnp.finfo(size.dtype).eps))
+    rounding = max(ROUNDING, 100 * float(jnp.finfo(size.dtype).eps))
     verdict = STABILITY.where(abs(size - 1) <= rounding, STABILITY.neutral, verdict)
     return STABILITY.where(array.isnan(size), STABILITY.unknown, verdict)
 
@@ -499,20 +497,46 @@ def distance(here: Any, there: Any, unit: Any = 1) -> Any:
 
 
 class MotionSections(NamedTuple):
-    """The sections of periodic motions: of one, or of several with equal periods."""
+    """The sections of a periodic motion, and the measure of distance by which it is recognised."""
 
-    states: Float[np.ndarray, "... cycles states"]
-    modes: Float[np.ndarray, "... cycles modes"]
+    states: Float[np.ndarray, "cycles states"]
+    modes: Float[np.ndarray, "cycles modes"]
     """The machine's own modes there."""
+    sizes: Any
+    """The `row_sizes` of the states."""
+    angles: np.ndarray | None
 
-    def passes(
-        self, state: np.ndarray, modes: np.ndarray, sizes: Any, angles: np.ndarray | None,
-        tolerance: float,
-    ) -> Bool[np.ndarray, "..."]:  # fmt: skip
-        """Return whether each motion passes through a state in these modes, on any section: then
-        the motion from there is the same one. `sizes` and `tolerance` as in `distance`."""
-        near = distance(nearest_images(angles, self.states, state), state, sizes) <= tolerance
-        return (near & (self.modes == modes).all(axis=-1)).any(axis=-1)
+    def near(self, states: np.ndarray, references: np.ndarray) -> np.ndarray:
+        """Move states by whole turns of their angles to where they are nearest to others."""
+        return nearest_images(self.angles, states, references)
+
+    def between(self, states: np.ndarray, references: np.ndarray) -> Any:
+        """Return the distance of states from others, up to whole turns."""
+        return distance(self.near(states, references), references, self.sizes)
+
+    def distance(self, states: np.ndarray) -> Any:
+        """Return the distance of states from the nearest section."""
+        return self.between(states[..., None, :], self.states).min(axis=-1)
+
+    def passes(self, state: np.ndarray, modes: np.ndarray, tolerance: float) -> bool:
+        """Return whether it passes through a state in these modes, on any section: then the motion
+        from there is the same one."""
+        near = self.between(self.states, state) <= tolerance
+        return bool((near & (self.modes == modes).all(axis=-1)).any())
+
+
+def index_of(
+    motions: Sequence[MotionSections], cycles: int, state: np.ndarray, modes: np.ndarray,
+    tolerance: float,
+) -> int:  # fmt: skip
+    """Return the index among known motions of that with a period of `cycles` through a state in
+    these modes; their number if it is a new one."""
+    known = (
+        i
+        for i, motion in enumerate(motions)
+        if len(motion.states) == cycles and motion.passes(state, modes, tolerance)
+    )
+    return next(known, len(motions))
 
 
 class Orbits(list[Orbit]):
@@ -558,7 +582,7 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
     """Return the different motions in several batches of searches, possibly for different periods,
     and the number of searches of each batch that found each, (motions, batches)."""
     chosen: list[Orbit] = []
-    paths: list[tuple[MotionSections, np.ndarray]] = []
+    motions: list[MotionSections] = []
     counts: list[np.ndarray] = []
     for batch, orbits in enumerate(batches):
         shape = orbits.residual.shape
@@ -574,12 +598,12 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
         modes = np.stack(flat.modes, axis=-1) if flat.modes else modes
         angles = angles_in(orbits.machine, jtu.tree_map(lambda x: x[0, 0], flat.sections))
         for i in np.flatnonzero(found):
-            path = MotionSections(sections[i, : cycles[i]], modes[i, : cycles[i]])
-            j = _index_of(paths, path, tolerance, angles)
-            if j == len(paths):
+            path = sections[i, : cycles[i]]
+            j = index_of(motions, len(path), path[0], modes[i, 0], tolerance)
+            if j == len(motions):
                 chosen.append(trimmed(jtu.tree_map(lambda x, i=i: jnp.asarray(x[i]), flat)))
-                sizes = sizes_on_host(chosen[j].machine, chosen[j].state, path.states)
-                paths.append((path, sizes))
+                sizes = sizes_on_host(chosen[j].machine, chosen[j].state, path)
+                motions.append(MotionSections(path, modes[i, : cycles[i]], sizes, angles))
                 counts.append(np.zeros(len(batches), int))
             counts[j][batch] += 1
     order = sorted(
@@ -587,16 +611,3 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
     )
     table = np.array([counts[j] for j in order], int).reshape(len(order), len(batches))
     return Orbits(chosen[j] for j in order), table
-
-
-def _index_of(
-    paths: list[tuple[MotionSections, np.ndarray]], path: MotionSections, tolerance: float,
-    angles: np.ndarray | None,
-) -> int:  # fmt: skip
-    """Return the index of a motion among the known ones, from any of its sections on, or their
-    number. `paths` holds the sections of each, and the sizes of their components."""
-    for j, (other, sizes) in enumerate(paths):
-        if len(other.states) == len(path.states):
-            if other.passes(path.states[0], path.modes[0], sizes, angles, tolerance):
-                return j
-    return len(paths)

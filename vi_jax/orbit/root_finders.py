@@ -18,6 +18,7 @@ from .._checks import count, instance_of, number, require
 from .._types import Scalar
 from ..machine import Shown
 from .linear import Matrix, solve, svd
+from .tolerances import LOCATED, ROUNDING
 
 # Above this singular value a motion is so unstable that rounding hides what is neutral: a choice.
 _STEEP = 1e3
@@ -40,9 +41,6 @@ def smallest_solution(matrix: Matrix, right_side: Array, threshold: float | None
     filled = (left * (is_zero.astype(matrix.dtype) * size)) @ right
     return solve(matrix + filled, right_side)
 
-
-# A motion smaller than the first share of the guess, or than the second, is at rest: choices.
-_NOTHING, _REST = 1e-6, 1e-9
 
 Unknowns = Float[Array, "..."]
 Residual = Callable[[Unknowns], Unknowns]
@@ -258,8 +256,8 @@ def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) 
 
     def unit(place):
         # A motion that comes to rest in the origin has no size to be relative to.
-        size = jnp.max(jnp.maximum(jnp.abs(place), _NOTHING * jnp.abs(guess)))
-        return jnp.where(size > _REST, size, 1.0)
+        size = jnp.max(jnp.maximum(jnp.abs(place), LOCATED * jnp.abs(guess)))
+        return jnp.where(size > ROUNDING, size, 1.0)
 
     memory, static = eqx.partition(root_finder.init(residual, x), eqx.is_array)
     history = jnp.full((root_finder.max_steps,), jnp.nan, x.dtype)

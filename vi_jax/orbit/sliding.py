@@ -27,16 +27,18 @@ from ..machine import (
     guard_of,
     mode_number,
 )
-from .corrector import Step, find_zero_near, observe, on_host, state_at
+from .corrector import Step, observe, on_host, state_at
 from .edit_events import without_events
 from .equations import Leg, Shooting
 from .flight import Event, Flight
 from .kinds import ADDING_SLIDING, CROSSING_SLIDING, GRAZING_SLIDING, SWITCHING_SLIDING
+from .locate import find_zero_near
+from .tolerances import LOCATED, ROUGHLY
 
 # A part of a motion vanishes if it is shorter than the first share of the period. The second share
-# is used if nothing else is found, as a corrector may not get closer. A guard below the third is
-# zero. Choices: special points are located far closer (see `locate_change`).
-_BRIEF, _NEARLY_BRIEF, _ZERO = 1e-4, 1e-2, 1e-6
+# is used if nothing else is found, as a corrector may not get closer. Choices: special points are
+# located far closer (see `locate_change`).
+_BRIEF, _NEARLY_BRIEF = 1e-4, 1e-2
 
 
 class Change(NamedTuple):
@@ -103,13 +105,13 @@ def _touching_part(problem: Shooting, at: Step) -> Change | None:
         return None
     leg, place = map(float, problem.leg_at(at.x, float(nearest.clock)))
     leg, mode = int(leg), _mode(problem, int(leg), number)
-    if abs(float(nearest.margin)) > _ZERO * nearest.unit:
+    if abs(float(nearest.margin)) > LOCATED * nearest.unit:
         return None
     excess, _, next_mode = excess_force(problem, at, leg, number, place)
     if not mode:  # to rounding it may still be held there
         return Change(number, place, (0.0, next_mode or 1.0, 0.0), False)
     # A surface holds a motion that touches it only if the field of the other side points to it.
-    is_held = excess < _ZERO * nearest.unit / problem.radian
+    is_held = excess < LOCATED * nearest.unit / problem.radian
     return Change(number, place, (mode, 0.0, mode), False) if is_held else None
 
 
@@ -127,7 +129,7 @@ def _change_at_event(problem: Shooting, at: Step) -> Change | None:
     if not found:
         return None
     share, rate, number, place, before, after = min(found)
-    if share > _ZERO:
+    if share > LOCATED:
         return None
     if rate > 0:  # at the limit of release
         return Change(number, place, (before, 0.0, after or -before), False)
@@ -169,13 +171,9 @@ def excess_force(
     return float(excess), float(rate), float(mode)
 
 
-# Events that are closer than this where they vanish are located well enough: a choice.
-_CLOSE = 1e-8
-
-
 def locate_change(problem: Shooting, at: Step, change: Change) -> Step:
     clock = problem.values(at.x)[0]
-    is_close = abs(float(at.observed.order_margin)) < _CLOSE * problem.radian
+    is_close = abs(float(at.observed.order_margin)) < ROUGHLY * problem.radian
     if not change.exists or problem.conditions or is_close:
         return at
     first = int(np.argmin(np.abs(clock - change.clock)))

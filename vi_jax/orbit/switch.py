@@ -13,18 +13,9 @@ import numpy as np
 from .._types import State
 from ..flow import simulate
 from ..machine import after_event, others_of, with_leaf
-from .boundary_events import PERIODS
+from .codimension_two import PERIODS
 from .conditions import AbstractCondition, FixedComponent, Special, bifurcation_tests
-from .corrector import (
-    Step,
-    advance,
-    jacobian_at,
-    locate_zero,
-    orbit_of,
-    sections_at,
-    state_at,
-    tangent_at,
-)
+from .corrector import Step, advance, jacobian_at, orbit_of, sections_at, state_at, tangent_at
 from .edit_events import admissible_near, over_periods, repeated, without_events
 from .equations import Shooting
 from .find import find_orbit
@@ -48,16 +39,17 @@ from .kinds import (
     starts,
 )
 from .local_map import graze_at
+from .locate import locate_zero
 from .results import Orbit
 from .sliding import change_at, without_part
 from .special import Point, point_at
+from .tolerances import LISTED, LOCATED
 from .torus import Torus, torus_near
-from .words import TOGETHER
 
 _ORBIT = "orbit"
 
-# Periods after which a stable motion has settled; most impacts of a cycle in the list: choices.
-_SETTLES, _LISTED = 100, 32
+# Periods after which a stable motion has settled: a choice.
+_SETTLES = 100
 
 
 def _orbit_at(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
@@ -140,7 +132,7 @@ def _swapped(point: Point) -> Iterator[State]:
     lengths = np.abs(problem.lengths(x)) / problem.radian
     for i, event in enumerate(problem.events):
         after = problem.events[(i + 1) % problem.legs]
-        if 0 not in (event.cycle, after.cycle) or lengths[i] > TOGETHER:
+        if 0 not in (event.cycle, after.cycle) or lengths[i] > LOCATED:
             continue
         state, modes = problem.unravel(states[i]), problem.modes_in(i - 1)
         # The section's state is the one just after it.
@@ -177,7 +169,7 @@ def _search(
         for guess in (*guesses, None):
             if guess is None:
                 guess = simulate(machine, guesses[-1], n, settle=_SETTLES * n, **options).last
-            found = find_orbit(machine, guess, n, impact_log=_LISTED, **options)
+            found = find_orbit(machine, guess, n, impact_log=LISTED, **options)
             if bool(found.successful) and accepts(found):
                 return found
     raise ValueError(

@@ -38,9 +38,8 @@ from ..machine import (
 from .birkhoff import agreement, rotation_number, weights, without_angles
 from .corrector import on_host
 from .cycle_map import CycleMap, cycle_map, map_state
-from .equations import ROUNDING, Observed, Shooting
+from .equations import Observed, Shooting
 from .from_orbit import (
-    LISTED,
     begins_after_jump,
     equations_along,
     fixed_step_method,
@@ -51,11 +50,20 @@ from .from_orbit import (
 )
 from .results import Orbit
 from .special import Point
-from .torus_equations import Curve, Equations, Solved, in_lanes, interpolated, modes
+from .tolerances import LISTED, ROUNDING, SAME
+from .torus_equations import (
+    Curve,
+    Equations,
+    Solved,
+    angles_of,
+    begin_on_section,
+    in_lanes,
+    interpolated,
+    modes,
+)  # fmt: skip
 
-# A torus is resolved if tail and residual are below the first number; nodes are doubled until the
-# tail is below the second. The tail falls by some digits with each doubling. Choices.
-RESOLVED, SETTLED = 1e-8, 1e-11
+# A torus is resolved if tail and residual are below this number: a choice.
+RESOLVED = 1e-8
 
 # The first and the largest number of nodes.
 _FIRST, MOST = 33, 513
@@ -69,10 +77,6 @@ _REPEATS, _LONGEST = 1e-8, 512
 
 # The curve through a run is near its sections, relative to their sizes: a choice.
 _NEAR = 0.1
-
-# A curve whose first mode is smaller than this share of its state is a fixed point: a choice, far
-# above the corrector's tolerance. With it any ρ would solve the equations.
-POINT = 1e-7
 
 # Steps of the exponents' averages, and those before. Two exponents are equal if they differ by less
 # than this multiple of the difference between both halves of the steps. Choices.
@@ -95,8 +99,6 @@ class Torus:
     """The equations of the motion from event to event."""
     curve: Curve
     """The solution at the nodes θ = j/N."""
-    like: State
-    """A state on the section, with the machine's own modes."""
 
     @property
     def machine(self) -> AbstractMachine:
@@ -128,7 +130,7 @@ class Torus:
     @cached_property
     def states(self) -> State:
         """States on the section at the nodes; a pytree like a start, leaves (nodes,)."""
-        return self.at(np.arange(self.nodes) / self.nodes)
+        return self.at(angles_of(self.nodes))
 
     def at(self, angle: Any) -> State:
         """Return the states on the section at angles θ, in turns; leaves have their shape."""
@@ -146,52 +148,47 @@ class Torus:
     def residual(self) -> float:
         """Largest component of P(u(θ)) - u(θ + ρ) halfway between the nodes, relative to the size
         of each. P is a simulation, which detects its events: a touch between two nodes counts."""
-        angles = (np.arange(self.nodes) + 0.5) / self.nodes
+        angles = angles_of(self.nodes) + 0.5 / self.nodes
         begin, wanted = (
             self.equations.on_section(self.curve, angles + turn) for turn in (0.0, self.rotation)
         )
         the_map = cycle_map(self.machine, self.cycles, method=self.method)
-        end = in_lanes(_mapped, (the_map, self.like), begin)
+        end = in_lanes(_mapped, (the_map, self.problem), begin)
         end = nearest_images(angles_in(self.machine, self.problem.like), end, wanted)
         difference = (end - wanted) / np.asarray(self.problem.sizes)[1:]
         return float(np.abs(difference).max()) if np.isfinite(difference).all() else np.inf
 
     @cached_property
-    def margins(self) -> "Margins":
-        """The least distances from other events."""
+    def margins(self) -> "list[Margin]":
+        """The least distances from other events, first that from stops and guards, last the speed
+        of approach of each event."""
         return margins_of(self.equations, self.curve)
 
     @property
     def clearance(self) -> float:
         """Smallest distance to a stop at a turn that does not touch it; infinite without such a
         turn, negative if the motion would pass through the stop."""
-        return float(self.margins.values[0])
+        return self.margins[0].value
 
     @property
     def slowest_impact(self) -> float:
         """Smallest V⁻; infinite without impacts."""
-        speeds = self.margins.values[4:][list(self.problem.impacts)]
-        return float(speeds.min(initial=np.inf))
+        speeds = self.margins[-len(self.problem.events) :]
+        return min((speeds[i].value for i in self.problem.impacts), default=np.inf)
 
     @cached_property
     def exponents(self) -> np.ndarray:
         """Lyapunov exponents per cycle, the greatest first, from the derivatives at the nodes; that
         along the curve is 0. One fewer than states if an event ends the machine's cycles."""
-        sizes = np.asarray(self.problem.sizes)[1:]
-        jacobians, along = self.equations.cocycle(self.curve)
-        jacobians, along = jacobians * sizes / sizes[:, None], along / sizes
+        matrices, along = self.equations.cocycle(self.curve)
         angles = np.mod(np.arange(_SKIPPED + _STEPS + 1) * self.rotation, 1.0)
-        matrices = interpolated(jacobians.reshape(self.nodes, -1), angles[:-1])
-        matrices = matrices.reshape(-1, *jacobians.shape[1:])
-        along = interpolated(along, angles)
-        along /= np.linalg.norm(along, axis=1, keepdims=True)
-        number = len(sizes) - 1 - self.problem.autonomous
+        flat = interpolated(matrices.reshape(self.nodes, -1), angles[:-1])
+        matrices, along = flat.reshape(-1, *matrices.shape[1:]), interpolated(along, angles)
+        number = along.shape[1] - 1 - self.problem.autonomous
         rates = np.asarray(_growth(jnp.asarray(matrices), jnp.asarray(along), number))[_SKIPPED:]
-        halves = [
-            weights(len(part)) @ part for part in (rates[: _STEPS // 2], rates[_STEPS // 2 :])
-        ]
-        error = np.abs(np.subtract(*halves))
         found = weights(_STEPS) @ rates
+        first, second = weights(_STEPS // 2) @ rates.reshape(2, -1, number)
+        error = np.abs(first - second)
         # A pair that turns in its plane has one exponent, but the averages of each of the two
         # converge slowly: only their sum does not depend on the directions.
         for k in range(number - 1):
@@ -202,17 +199,16 @@ class Torus:
     @cached_property
     def reason(self) -> str:
         """The reason why this is not a quasi-periodic motion of the machine; "" if it is one."""
-        crossed = self.margins.crossed
-        if first_mode(self.equations, self.curve)[1] < POINT:
+        lowest = min(self.margins, key=lambda margin: margin.share)
+        if first_mode(self.equations, self.curve)[1] < SAME:
             return "The curve has shrunk to a periodic motion, which any rotation number solves."
         if self.tail > RESOLVED:
             return (
                 f"The curve is not resolved by {self.nodes} nodes: its highest modes are "
                 f"{self.tail:.1g} of the largest. Use more `nodes`."
             )
-        if crossed is not None:
-            words = self.margins.in_words(self.problem, crossed)
-            return f"The motion has other events than the equations: {words}."
+        if lowest.crossed:
+            return f"The motion has other events than the equations: {lowest}."
         if not self.residual < RESOLVED:
             return (
                 f"Simulations leave the curve between its nodes, by {self.residual:.1g}. Use more "
@@ -238,8 +234,9 @@ class Torus:
 
 @compiled
 def _growth(matrices, along, number: int):
-    """Return the logarithms of the growth of `number` directions in each step, across the unit
-    vectors `along` the curve."""
+    """Return the logarithms of the growth of `number` directions in each step, across the
+    directions `along` the curve."""
+    along /= jnp.linalg.norm(along, axis=1, keepdims=True)
 
     def across(frame, direction):
         return frame - jnp.outer(direction, direction @ frame)
@@ -254,31 +251,52 @@ def _growth(matrices, along, number: int):
     return jax.lax.scan(step, frame, (matrices, along[1:]))[1]
 
 
-class Margins(NamedTuple):
-    """Least distances of the motions on a curve from other events, each over all angles."""
+class Margin(NamedTuple):
+    """A distance of the motions on a curve from another order of events, the least over all angles;
+    negative beyond the change."""
 
-    values: np.ndarray
-    """The least clearance, time between two events, agreement of modes and time from the section,
-    then the least speed of approach of each event."""
-    shares: np.ndarray
-    """These, relative to their sizes along the motion."""
-    angles: np.ndarray
-    """The angle of each, in turns."""
+    change: str
+    """What changes there, in words."""
+    value: float
+    share: float
+    """The value relative to its size along the motion."""
+    angle: float
+    """The place on the curve, in turns."""
 
     @property
-    def crossed(self) -> int | None:
-        """The number of the most negative margin; `None` if none is negative beyond rounding."""
-        lowest = int(np.argmin(self.shares))
-        return lowest if not self.shares[lowest] >= -ROUNDING else None
+    def crossed(self) -> bool:
+        return not self.share >= -ROUNDING
 
-    def in_words(self, problem: Shooting, number: int) -> str:
-        named = ["it touches a stop or a guard", "two events change their order"]
-        named += ["a switch goes into another mode", "an event passes the section"]
-        named += [f"the {event.name_on(problem.machine)} is missed" for event in problem.events]
-        return f"{named[number]} at θ = {self.angles[number] % 1:.4g}"
+    def __str__(self) -> str:
+        return f"{self.change} at θ = {self.angle % 1:.4g}"
 
 
-def _columns(problem: Shooting, x: np.ndarray, observed: Observed) -> tuple[np.ndarray, np.ndarray]:
+# Changes other than the loss of an event, in the order of `margins_of`.
+TOUCH, *REORDERED = (
+    "it touches a stop or a guard", "two events change their order",
+    "a switch goes into another mode", "an event passes the section",
+)  # fmt: skip
+
+
+def margins_of(equations: Equations, curve: Curve) -> list[Margin]:
+    """Return the margins; a search between the nodes closes in on the least of each."""
+    problem = equations.motion(curve.p)
+    values, shares = _values(problem, curve.x, equations.observe(curve))
+    centre, width = np.argmin(values, axis=0) / len(values), 1.0 / len(values)
+    each = np.arange(values.shape[1])
+    for _ in range(_CLOSER):
+        angles = centre[:, None] + width * np.linspace(-1, 1, _PLACES)
+        flat = angles.ravel()
+        found = _values(problem, interpolated(curve.x, flat), equations.observe(curve, flat))
+        values, shares = (a.reshape(len(each), _PLACES, -1)[each, :, each] for a in found)
+        index = np.clip(np.argmin(values, axis=1), 1, _PLACES - 2)
+        centre, width = angles[each, index], 2.0 * width / (_PLACES - 1)
+    lost = [f"the {event.name_on(problem.machine)} is missed" for event in problem.events]
+    rows = np.stack([values.min(axis=1), shares.min(axis=1), centre], axis=1).tolist()
+    return [Margin(c, *row) for c, row in zip([TOUCH, *REORDERED, *lost], rows, strict=True)]
+
+
+def _values(problem: Shooting, x: np.ndarray, observed: Observed) -> tuple[np.ndarray, np.ndarray]:
     """Return the margins of motions, and relative to their sizes, (angles, margins)."""
     count, section = len(problem.events), np.full(len(x), np.inf)
     if count and not problem.autonomous and problem.events[0].cycle != 0:
@@ -290,22 +308,6 @@ def _columns(problem: Shooting, x: np.ndarray, observed: Observed) -> tuple[np.n
     return values, values / np.column_stack([*units, observed.units])
 
 
-def margins_of(equations: Equations, curve: Curve) -> Margins:
-    """Return the margins; a search between the nodes closes in on the least of each."""
-    problem = equations.motion(curve.p)
-    values, shares = _columns(problem, curve.x, equations.observe(curve))
-    centre, width = np.argmin(values, axis=0) / len(values), 1.0 / len(values)
-    each = np.arange(values.shape[1])
-    for _ in range(_CLOSER):
-        angles = centre[:, None] + width * np.linspace(-1, 1, _PLACES)
-        flat = angles.ravel()
-        found = _columns(problem, interpolated(curve.x, flat), equations.observe(curve, flat))
-        values, shares = (a.reshape(len(each), _PLACES, -1)[each, :, each] for a in found)
-        index = np.clip(np.argmin(values, axis=1), 1, _PLACES - 2)
-        centre, width = angles[each, index], 2.0 * width / (_PLACES - 1)
-    return Margins(values.min(axis=1), shares.min(axis=1), centre)
-
-
 def first_mode(equations: Equations, curve: Curve) -> tuple[np.ndarray, float]:
     """Return the first Fourier mode of a curve, in scaled unknowns, and its largest component."""
     mode = np.fft.fft(curve.x / equations.scale, axis=0)[1] / len(curve.x)
@@ -313,37 +315,23 @@ def first_mode(equations: Equations, curve: Curve) -> tuple[np.ndarray, float]:
 
 
 @on_host
-def _mapped(map_and_state: tuple[CycleMap, State], rows):
+def _mapped(map_and_equations: tuple[CycleMap, Shooting], rows):
     """Return the states on the section after the period of a map, from states on it."""
-    the_map, like = map_and_state
-    start = lambda row: with_modes(raveled(like)[1](row), modes_of(like) or ())
-    return jax.vmap(lambda row: raveled(the_map(start(row)))[0])(rows)
+    the_map, problem = map_and_equations
+    return jax.vmap(lambda row: raveled(the_map(begin_on_section(problem, row)))[0])(rows)
 
 
 def _start_equations(
     machine: AbstractMachine, method: AbstractMethod, like: State, cycles: int, rows: np.ndarray,
     rotation: float,
-) -> tuple[Shooting, np.ndarray]:  # fmt: skip
-    """Return the equations of the motions that begin in some states of a curve on the section, and
-    their values of the unknowns, (nodes, unknowns)."""
-    motions, plain = [], without_modes(like)
-    for row in rows:
-        start = with_modes(raveled(like)[1](jnp.asarray(row)), modes_of(like) or ())
-        run = simulate(machine, start, cycles, method=method, event_log=LISTED + 1)
-        assert run.event_log is not None
-        if np.isin(run.event_log.kind, (EventKind.rest, EventKind.release)).any():
-            raise ValueError(
-                "Argument `start` must settle on a motion in flight, but it rests on a stop. Tori "
-                "of motions that rest are not supported."
-            )
-        begins, found = placed_events(machine, run, "start")
-        found, period = with_sections(machine, plain, begins, found, cycles), float(begins[-1])
-        motions.append(equations_along(machine, method, start, found, period, cycles, [machine]))
-    problem, x = (
-        max((p for p, _ in motions), key=lambda p: p.steps),
-        np.stack([x for _, x in motions]),
-    )
-    for i, (other, _) in enumerate(motions):
+) -> tuple[Equations, np.ndarray]:  # fmt: skip
+    """Return the equations of the curve through some states on the section, and the unknowns of the
+    motions that begin there, (nodes, unknowns)."""
+    unravel, modes = raveled(like)[1], modes_of(like) or ()
+    starts = [with_modes(unravel(jnp.asarray(row)), modes) for row in rows]
+    problems, xs = zip(*(_followed(machine, method, s, cycles) for s in starts), strict=True)
+    problem, x = max(problems, key=lambda p: p.steps), np.stack(xs)
+    for i, other in enumerate(problems):
         if (other.events, other.modes) != (problem.events, problem.modes):
             raise ValueError(
                 "Argument `start` must settle on a motion whose cycles all have the same events in "
@@ -354,14 +342,29 @@ def _start_equations(
     if problem.events and begins_after_jump(machine, problem.events[0]):
         # Its state is that before the jump, which ends the motion from θ - ρ.
         states = slice(problem.legs, problem.legs + problem.states)
-        angles = np.arange(len(rows)) / len(rows)
-        x[:, states] = interpolated(x[:, states], angles - rotation)
+        x[:, states] = interpolated(x[:, states], angles_of(len(rows)) - rotation)
     largest = Equations(problem).observe(Curve(x, rotation, np.zeros(0))).largest
-    return with_sizes(problem, x[0], largest.max(axis=0)), x
+    return Equations(with_sizes(problem, x[0], largest.max(axis=0))), x
 
 
-def torus_of(solved: Solved, equations: Equations, like: State) -> Torus:
-    return Torus(equations.motion(solved.curve.p), solved.curve._replace(p=np.zeros(0)), like)
+def _followed(
+    machine: AbstractMachine, method: AbstractMethod, start: State, cycles: int
+) -> tuple[Shooting, np.ndarray]:
+    """Return the equations of the motion from a state, and its values of the unknowns."""
+    run = simulate(machine, start, cycles, method=method, event_log=LISTED + 1)
+    assert run.event_log is not None
+    if np.isin(run.event_log.kind, (EventKind.rest, EventKind.release)).any():
+        raise ValueError(
+            "Argument `start` must settle on a motion in flight, but it rests on a stop. Tori of "
+            "motions that rest are not supported."
+        )
+    begins, found = placed_events(machine, run, "start")
+    found = with_sections(machine, without_modes(start), begins, found, cycles)
+    return equations_along(machine, method, start, found, float(begins[-1]), cycles, [machine])
+
+
+def torus_of(solved: Solved, equations: Equations) -> Torus:
+    return Torus(equations.motion(solved.curve.p), solved.curve._replace(p=np.zeros(0)))
 
 
 def find_torus(
@@ -413,8 +416,30 @@ def find_torus(
         rotation = given_number("rotation", rotation, low=0.0, high=1.0)
     machine = cycle_map(machine, cycles, method=method).machine
     method = torus_method(method, machine)
-    start = start.last if isinstance(start, Run) else start
-    like = map_state(machine, machine.start() if start is None else start, "start")
+    start = machine.start() if start is None else start
+    run = _settled(machine, method, start, cycles, settle, observed)
+    rows = in_rows(run.sections)[::cycles]
+    rows = np.asarray(nearest_images(angles_in(machine, without_modes(run.last)), rows, rows[0]))
+    measured = _measured_rotation(machine, without_modes(run.last), rows, cycles)
+    rotation = measured if rotation is None else rotation
+    values = _curve_through(rows, _FIRST if nodes is None else nodes, rotation)
+    equations, x = _start_equations(machine, method, run.last, cycles, values, rotation)
+    solved = equations.solve_near(Curve(x, rotation, np.zeros(0)))
+    solved = equations.refined(solved, MOST if nodes is None else nodes)
+    if solved is None:
+        raise ValueError(
+            f"No torus with a rotation number near {rotation:.6g} was found from this run. Observe "
+            "more cycles (`settle`, `observed`), or give more `nodes`."
+        )
+    return torus_of(solved, equations)
+
+
+def _settled(
+    machine: AbstractMachine, method: AbstractMethod, start: Any, cycles: int, settle: int,
+    observed: int,
+) -> Run:  # fmt: skip
+    """Return the sections of so many periods of the motion on which a start settles."""
+    like = map_state(machine, start.last if isinstance(start, Run) else start, "start")
     if machine.position(without_modes(like)).dtype != jnp.float64:
         raise ValueError(
             "Argument `start` must be of double precision: call "
@@ -428,28 +453,7 @@ def find_torus(
             "Argument `start` must begin a motion that can be simulated, but the run failed: "
             f"{RESULTS[run.result]}"
         )
-    rows = np.asarray(in_rows(run.sections))[::cycles]
-    rows = np.asarray(nearest_images(angles_in(machine, without_modes(like)), rows, rows[0]))
-    measured = _measured_rotation(machine, like, rows, cycles)
-    rotation = measured if rotation is None else rotation
-    values, misses = _curve_through(rows, _FIRST if nodes is None else nodes, rotation)
-    if misses > _NEAR:
-        raise ValueError(
-            "Argument `start` must settle on one closed curve on the section, but the curve with "
-            f"rotation number {rotation:.6g} misses its sections by {misses:.2g} of their spread. "
-            "Give the number of `cycles` after which it returns to the same curve, or `rotation`."
-        )
-    problem, x = _start_equations(machine, method, run.last, cycles, values, rotation)
-    equations = Equations(problem)
-    solved = equations.solve_near(Curve(x, rotation, np.zeros(0)))
-    if solved is not None and nodes is None:
-        solved = equations.refined(solved, SETTLED, MOST)
-    if solved is None:
-        raise ValueError(
-            f"No torus with a rotation number near {rotation:.6g} was found from this run. Observe "
-            "more cycles (`settle`, `observed`), or give more `nodes`."
-        )
-    return torus_of(solved, equations, run.last)
+    return run
 
 
 def torus_method(given: MethodLike, machine: AbstractMachine) -> AbstractMethod:
@@ -462,7 +466,7 @@ def _measured_rotation(
     machine: AbstractMachine, like: State, rows: np.ndarray, cycles: int
 ) -> float:
     """Return the rotation number of a run that is quasi-periodic, else raise `ValueError`."""
-    sizes = sizes_on_host(machine, without_modes(like), rows)
+    sizes = sizes_on_host(machine, like, rows)
     differences = (np.abs(rows[-1] - rows[-_LONGEST - 1 : -1]) / sizes).max(axis=1)[::-1]
     repeats = np.flatnonzero(differences < _REPEATS)
     if len(repeats):
@@ -471,7 +475,7 @@ def _measured_rotation(
             "Argument `start` must settle on a quasi-periodic motion, but this one repeats after "
             f"{period}: find and follow that orbit."
         )
-    seen = without_angles(jnp.asarray(rows), sizes, angles_in(machine, without_modes(like)))
+    seen = without_angles(jnp.asarray(rows), sizes, angles_in(machine, like))
     digits = float(agreement(seen))
     if digits < _DIGITS:
         raise ValueError(
@@ -482,15 +486,20 @@ def _measured_rotation(
     return float(rotation_number(seen))
 
 
-def _curve_through(rows: np.ndarray, nodes: int, rotation: float) -> tuple[np.ndarray, float]:
-    """Return the states at the nodes of the curve through the sections of a run, and the distance
-    of the sections from it, relative to their spread. Its modes are weighted averages."""
-    number, instants = modes(nodes), np.arange(len(rows))
-    waves = np.exp(-2j * np.pi * np.outer(number, instants * rotation % 1.0))
+def _curve_through(rows: np.ndarray, nodes: int, rotation: float) -> np.ndarray:
+    """Return the states at the nodes of the closed curve through the sections of a run. Its modes
+    are weighted averages."""
+    waves = np.exp(-2j * np.pi * np.outer(modes(nodes), np.arange(len(rows)) * rotation % 1.0))
     coefficients = (waves * weights(len(rows))) @ rows
-    values = np.fft.ifft(coefficients * nodes, axis=0).real
     missed = rows - np.real(waves.conj().T @ coefficients)
-    return values, float((missed.std(axis=0) / np.maximum(rows.std(axis=0), 1e-300)).max())
+    misses = float((missed.std(axis=0) / np.maximum(rows.std(axis=0), 1e-300)).max())
+    if misses > _NEAR:
+        raise ValueError(
+            "Argument `start` must settle on one closed curve on the section, but the curve with "
+            f"rotation number {rotation:.6g} misses its sections by {misses:.2g} of their spread. "
+            "Give the number of `cycles` after which it returns to the same curve, or `rotation`."
+        )
+    return np.fft.ifft(coefficients * nodes, axis=0).real
 
 
 def torus_near(orbit: Orbit, parameter: str, width: float, distance: float) -> Torus:
@@ -499,26 +508,23 @@ def torus_near(orbit: Orbit, parameter: str, width: float, distance: float) -> T
     like, machine = orbit.state, orbit.machine
     rows, method = np.asarray(raveled(without_modes(like))[0])[None], torus_method(None, machine)
     motion, x = _start_equations(machine, method, like, int(orbit.cycles), rows, 0.0)
-    equations = Equations(with_parameter(motion, parameter, width))
+    equations = Equations(with_parameter(motion.problem, parameter, width))
     point = Curve(x, 0.0, np.array([float(leaf(machine, parameter))]))
     rotation, mode = equations.rotating_mode(point)
-    waves = np.exp(2j * np.pi * np.arange(_FIRST) / _FIRST)[:, None]
+    waves = np.exp(2j * np.pi * angles_of(_FIRST))[:, None]
     mode = mode / np.linalg.norm(mode)
     circle = 2 * distance * np.real(waves * mode) * equations.scale
     # The first mode has this size and phase; ρ and the parameter are free.
     row = (waves.conj() * mode.conj()).ravel() / np.sqrt(_FIRST)
-    held = [
-        (np.append(part, [0.0, 0.0]), size)
-        for part, size in ((row.imag, 0.0), (row.real, distance))
-    ]
+    held = [(np.append(row.imag, [0.0, 0.0]), 0.0), (np.append(row.real, [0.0, 0.0]), distance)]
     solved = equations.solve(Curve(x + circle, rotation, point.p), held)
-    solved = None if solved is None else equations.refined(solved, SETTLED, MOST)
+    solved = equations.refined(solved, MOST)
     if solved is None:
         raise ValueError(
             f"No torus was found at distance {distance:g} from this Neimark–Sacker point. Try a "
             "shorter distance."
         )
-    return torus_of(solved, equations, like)
+    return torus_of(solved, equations)
 
 
 def with_parameter(

@@ -16,18 +16,18 @@ from .find import find_orbit
 from .from_orbit import check_parameter
 from .kinds import GRAZING, TORUS
 from .results import Orbit
+from .tolerances import SAME
 from .torus import (
     MOST,
-    POINT,
+    REORDERED,
     RESOLVED,
-    SETTLED,
     Torus,
     first_mode,
     margins_of,
     torus_of,
     with_parameter,
 )
-from .torus_equations import Curve, Equations, Solved, derivative, interpolated
+from .torus_equations import Curve, Equations, Solved, angles_of, derivative, interpolated
 from .walk import BOUNDS, INTERRUPTED, SAME_CURVE, STALLED, check_walk
 
 # Reasons to end: at a ratio p:q, where the motion locks; the nodes do not suffice; events change
@@ -131,13 +131,11 @@ class TorusBranch:
         i = int(np.argmax(inside))
         share = (value - parameter[i]) / (parameter[i + 1] - parameter[i])
         guess = points[i].curve.towards(points[i + 1].curve, share)
-        solved = equations.solve_near(guess, value)
-        solved = None if solved is None else equations.refined(solved, SETTLED, most)
+        solved = equations.refined(equations.solve_near(guess, value), most)
         if solved is None:
             raise ValueError(f"No torus was found at {self.name} = {value:.10g}.")
         # The nodes are doubled across the family; the last correction is at the value itself.
-        solved = equations.solve_near(solved.curve, value) or solved
-        return torus_of(solved, equations, self.tori[i].like)
+        return torus_of(equations.solve_near(solved.curve, value) or solved, equations)
 
     def __repr__(self) -> str:
         units, values = units_of(self.tori[0].machine), self.parameter
@@ -197,7 +195,7 @@ def continue_torus(
     def result() -> TorusBranch:
         ahead, back = walks
         points = [*reversed(back.points[1:]), *ahead.points]
-        tori = [torus_of(point, equations, torus.like) for point in points]
+        tori = [torus_of(point, equations) for point in points]
         return TorusBranch(
             parameter, tori, (back.end.reason, ahead.end.reason),
             (back.end.detail, ahead.end.detail), [*reversed(back.windows), *ahead.windows],
@@ -219,8 +217,9 @@ class _Walk:
         most: int,
     ):  # fmt: skip
         self.equations, self.bounds, self.most = equations, bounds, most
-        self.points, self.windows, self.end = [start], [], _End(INTERRUPTED)
-        self.ahead = sense * equations.unit(start.tangent)  # the direction, in the last nodes
+        ahead = start.tangent.plus(sense - 1.0, start.tangent)
+        self.points, self.windows = [equations.directed(start, ahead)], []
+        self.end = _End(INTERRUPTED)
 
     def walk(
         self, report: ReportProgress, *, step: float, max_step: float, max_points: int
@@ -244,19 +243,17 @@ class _Walk:
     def _advance(self, length: float) -> Solved | str:
         """Return the next torus, at a distance ahead along the family, or the word for the end of
         the family if none is found there."""
-        equations, here = self.equations, self.points[-1].curve
-        ahead = equations.unpack(self.ahead, len(here.x))
-        guess = Curve(*(a + length * b for a, b in zip(here, ahead, strict=True)))  # pyright: ignore
+        equations, here, ahead = self.equations, self.points[-1].curve, self.points[-1].tangent
         held = [equations.phase(here), equations.across(here, ahead, length)]
-        new = equations.solve(guess, held)
+        new = equations.solve(here.plus(length, ahead), held)
         if new is None or equations.tail(new.curve) > _SPURIOUS:
             return STALLED if new is None else COARSE
         (before, _), (after, size) = (first_mode(equations, c) for c in (here, new.curve))
-        if np.vdot(before, after).real <= 0 or size < POINT:
+        if np.vdot(before, after).real <= 0 or size < SAME:
             return TORUS
-        if equations.unit(new.tangent) @ self.ahead < SAME_CURVE:
+        if equations.unit(new.tangent) @ equations.pack(ahead) < SAME_CURVE:
             return STALLED
-        finer = equations.refined(new, SETTLED, self.most)
+        finer = equations.refined(new, self.most)
         if finer is None or equations.tail(finer.curve) > RESOLVED:
             return COARSE
         return finer
@@ -267,11 +264,7 @@ class _Walk:
         for p, q in _ratios(here.rotation, new.curve.rotation):
             share = (p / q - here.rotation) / (new.curve.rotation - here.rotation)
             self.windows.append(self._window(here.towards(new.curve, share), p, q))
-        nodes = len(new.curve.x)
-        before = self.equations.unpack(self.ahead, len(here.x)).with_nodes(nodes)
-        ahead = self.equations.unit(new.tangent)
-        self.ahead = ahead * np.sign(ahead @ self.equations.pack(before))
-        self.points.append(new)
+        self.points.append(self.equations.directed(new, self.points[-1].tangent))
 
     def _ending(self, new: Solved) -> tuple[_End | None, Solved | None]:
         """Return how the family ends before a torus, if it does, and its last torus."""
@@ -284,41 +277,39 @@ class _Walk:
             if at is None:
                 return _End(STALLED), None
             end, new = _End(BOUNDS), at
-        crossed = margins_of(equations, new.curve).crossed
-        if crossed is None:
+        margins = margins_of(equations, new.curve)
+        number = int(np.argmin([margin.share for margin in margins]))
+        if not margins[number].crossed:
             return end, new
-        at = self._locate(new, crossed)
+        at = self._locate(new, number)
         if at is None:
             return _End(STALLED, "an event changes, at a place that was not located"), None
-        problem = equations.motion(at.curve.p)
-        words = margins_of(equations, at.curve).in_words(problem, crossed)
-        return _End(ORDER if crossed in (1, 2, 3) else GRAZING, words), at
+        met = margins_of(equations, at.curve)[number]
+        return _End(ORDER if met.change in REORDERED else GRAZING, str(met)), at
 
     def _locate(self, new: Solved, number: int) -> Solved | None:
         """Return the torus at which a margin is zero, between the last one and another."""
         equations, here = self.equations, self.points[-1].curve
-        found: dict[float, Solved] = {}
+        solved_at = lambda share: equations.solve_near(here.towards(new.curve, share))
 
         def margin(share: float) -> float:
-            guess = here.towards(new.curve, share)
-            solved = equations.solve_near(guess)
+            solved = solved_at(share)
             if solved is None:
                 raise ArithmeticError
-            found[share] = solved
-            return float(margins_of(equations, solved.curve).values[number])
+            return margins_of(equations, solved.curve)[number].value
 
         from scipy.optimize import brentq  # slow to load
 
         try:
-            return found[brentq(margin, 0.0, 1.0, xtol=1e-12)]  # pyright: ignore
-        except (ArithmeticError, ValueError, KeyError):
+            return solved_at(brentq(margin, 0.0, 1.0, xtol=1e-12))  # pyright: ignore
+        except (ArithmeticError, ValueError):
             return None
 
     def _stalled(self, longest: float, reason: str) -> _End:
         """Return the end where no shorter step helps: at a window of locking close ahead, or for
         the reason of the last step."""
         here, base = self.points[-1].curve, self.points[-min(_BACK, len(self.points))].curve
-        ahead = self.equations.unpack(self.ahead, len(here.x))
+        ahead = self.points[-1].tangent
         sense, value = np.sign(ahead.p[-1]), float(here.p[-1])
         for p, q in _ratios(here.rotation, here.rotation + _REACH * longest * ahead.rotation):
             window = self._window(base, p, q)
@@ -330,21 +321,18 @@ class _Walk:
 
     def _window(self, curve: Curve, p: int, q: int) -> Window:
         """Return the interval of the parameter of motions that lock to p:q, near a curve."""
-        cycles: list[Curve] = []
-        for place in np.arange(_ANGLES) / (_ANGLES * q):
+        unknown, cycles = Window(p, q, np.nan, np.nan, self.equations, None), []
+        for place in angles_of(_ANGLES) / q:
             cycle = self._locked(curve, p, q, place)
             if cycle is None:
-                break
+                return unknown
             cycles.append(cycle)
         values = np.array([cycle.p[-1] for cycle in cycles])
-        unknown = Window(p, q, np.nan, np.nan, self.equations, None)
-        if len(cycles) < _ANGLES:
-            return unknown
         middle = values.mean()
         high = np.abs(np.fft.rfft(values))[_ANGLES // 3 :].max() / _ANGLES
         if high > _SMOOTH * np.ptp(values) + _ROUNDING * abs(middle):
             return unknown
-        between = interpolated((values - middle)[:, None], np.arange(_BETWEEN) / _BETWEEN)
+        between = interpolated((values - middle)[:, None], angles_of(_BETWEEN))
         low, high = middle + between.min(), middle + between.max()
         near = np.argsort(np.abs(values - 0.5 * (low + high)))[: _ANGLES // 2]
         cycle = min((cycles[i] for i in near), key=self.equations.growth)

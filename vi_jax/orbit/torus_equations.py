@@ -21,43 +21,43 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from .corrector import on_host
+from .._types import State
+from ..machine import own_modes, with_modes
+from .corrector import on_host, scaled_jacobian
 from .equations import Shooting
+from .tolerances import CORRECTED, ROUGHLY
 
 # Rows that a compiled program takes at once, a choice: fewer are filled up.
 _LANES = 64
 
-# The largest scaled component of the last correction: usually (the next would be its square), and
-# if it is rounding; the most corrections; the largest one that is made at once. Choices.
-_TOLERANCE, _ROUNDED, _MOST, _LONGEST = 1e-9, 1e-8, 14, 0.3
+# The largest scaled component of the last correction (the next would be its square), if rounding
+# does not keep it above; the most corrections; the largest one that is made at once. Choices.
+_TOLERANCE, _MOST, _LONGEST = 1e-9, 14, 0.3
 
 # The tail of a spectrum are the modes above this share of the highest: a choice.
 _TAIL = 0.8
 
 
-def in_lanes(program: Callable[..., Any], problem: Any, *rows: np.ndarray) -> Any:
+def in_lanes(program: Callable[..., Any], shared: Any, *rows: np.ndarray) -> Any:
     """Return the results of a compiled program for rows of arguments, some at a time."""
     count, parts = len(rows[0]), []
     for begin in range(0, count, _LANES):
         index = np.minimum(np.arange(begin, begin + _LANES), count - 1)
-        parts.append(program(problem, *(np.asarray(a, float)[index] for a in rows)))
+        parts.append(program(shared, *(np.asarray(a, float)[index] for a in rows)))
     return jax.tree.map(lambda *a: np.concatenate(a)[:count], *parts)
 
 
 @on_host
-def _linearize(problem: Shooting, x, following, p):
-    size = x.shape[1]
+def _linearize(problem_and_sizes: tuple[Shooting, np.ndarray], x, following, p):
+    """Return derivatives and residuals of motions, both divided by the largest derivative in each
+    row, with respect to the unknowns of a motion and of the following one, and the parameters."""
+    (problem, sizes), size = problem_and_sizes, x.shape[1]
 
-    def along(x, following, p):
-        def residual(z):
-            motion = jnp.concatenate([z[:size], z[2 * size :]])
-            return problem.motion_residual(motion, following=z[size : 2 * size])
+    def residual(z):
+        own, following, p = jnp.split(z * sizes, [size, 2 * size])
+        return problem.motion_residual(jnp.concatenate([own, p]), following=following)
 
-        z = jnp.concatenate([x, following, p])
-        pushed = lambda direction: jax.jvp(residual, (z,), (direction,))
-        values, columns = jax.vmap(pushed)(jnp.eye(z.size, dtype=z.dtype))
-        return values[0], columns.T
-
+    along = lambda *z: scaled_jacobian(residual, jnp.concatenate(z) / sizes)[:2]
     return jax.vmap(along)(x, following, p)
 
 
@@ -72,8 +72,7 @@ def _rates(problem: Shooting, x):
 
     def rate(x):
         clock, states = problem.parts(x)
-        smooth = problem.flight(problem.at(x), problem.legs - 1).smooth
-        return ravel_pytree(smooth.field(clock[0], problem.unravel(states[0])))[0]
+        return problem.flight(problem.at(x), problem.legs - 1).rate(clock[0], states[0])
 
     return jax.vmap(rate)(x)
 
@@ -95,6 +94,12 @@ def begins_on_section(problem: Shooting) -> bool:
     return bool(problem.events) and problem.events[0].cycle == 0
 
 
+def begin_on_section(problem: Shooting, row: Any) -> State:
+    """Return a state on the section, with the machine's own modes."""
+    leg = 0 if begins_on_section(problem) else problem.legs - 1
+    return with_modes(problem.unravel(row), own_modes(problem.machine, problem.modes_in(leg)))
+
+
 def modes(number: int) -> np.ndarray:
     """Return the numbers of the Fourier modes of so many rows."""
     return np.fft.fftfreq(number, 1 / number)
@@ -112,22 +117,9 @@ def derivative(rows: np.ndarray) -> np.ndarray:
     return np.fft.ifft(np.fft.fft(rows, axis=0) * waves, axis=0).real
 
 
-def spectral_tail(rows: np.ndarray) -> float:
-    """Return the largest high mode of a curve, relative to its largest mode."""
-    size, number = np.abs(np.fft.fft(rows, axis=0)).max(axis=1), np.abs(modes(len(rows)))
-    largest = size[number > 0].max(initial=0.0)
-    high = size[number > _TAIL * (len(rows) // 2)].max()
-    return float(high / largest) if largest > 0 else 1.0
-
-
-def _circulant(number: int, rotation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matrix that interpolates rows at angles further by `rotation`, and its
-    derivative."""
-    waves = np.exp(2j * np.pi * modes(number) * rotation)
-    index = np.subtract.outer(np.arange(number), np.arange(number)) % number
-    columns = (np.fft.ifft(a).real for a in (waves, 2j * np.pi * modes(number) * waves))
-    value, slope = (column[index] for column in columns)
-    return value, slope
+def angles_of(number: int) -> np.ndarray:
+    """Return the angles of so many nodes, in turns."""
+    return np.arange(number) / number
 
 
 class Curve(NamedTuple):
@@ -141,13 +133,16 @@ class Curve(NamedTuple):
     """Parameters, (parameters,)."""
 
     def with_nodes(self, number: int) -> "Curve":
-        return self._replace(x=interpolated(self.x, np.arange(number) / number))
+        return self._replace(x=interpolated(self.x, angles_of(number)))
 
     def towards(self, other: "Curve", share: float) -> "Curve":
         """Return the curve at a share of the way to another one."""
         nodes = max(len(self.x), len(other.x))
-        parts = zip(self.with_nodes(nodes), other.with_nodes(nodes), strict=True)
-        return Curve(*((1 - share) * a + share * b for a, b in parts))  # pyright: ignore
+        here, there = self.with_nodes(nodes), other.with_nodes(nodes)
+        return here.plus(share, jax.tree.map(np.subtract, there, here))
+
+    def plus(self, share: float, change: "Curve") -> "Curve":
+        return jax.tree.map(lambda a, b: a + share * b, self, change)
 
 
 Condition = tuple[np.ndarray, float]
@@ -156,8 +151,6 @@ Condition = tuple[np.ndarray, float]
 
 class Solved(NamedTuple):
     curve: Curve
-    size: float
-    """The largest scaled component of the last correction."""
     iterations: int
     tangent: Curve
     """The change of the unknowns for a change of the last condition's value."""
@@ -190,7 +183,12 @@ class Equations:
         return Curve(x, float(row[end]), row[end + 1 :] * self.widths)
 
     def tail(self, curve: Curve) -> float:
-        return spectral_tail(curve.x / self.scale)
+        """Return the largest high mode of a curve, relative to its largest mode."""
+        size = np.abs(np.fft.fft(curve.x / self.scale, axis=0)).max(axis=1)
+        number = np.abs(modes(len(size)))
+        largest = size[number > 0].max(initial=0.0)
+        high = size[number > _TAIL * (len(size) // 2)].max()
+        return float(high / largest) if largest > 0 else 1.0
 
     def motion(self, p: np.ndarray) -> Shooting:
         """Return the equations of the motion alone at these values of the parameters."""
@@ -199,22 +197,23 @@ class Equations:
 
     def observe(self, curve: Curve, angles: np.ndarray | None = None) -> Any:
         """Return `Observed` of the motion from each node, or from other angles, in arrays."""
-        angles = np.arange(len(curve.x)) / len(curve.x) if angles is None else angles
+        angles = angles_of(len(curve.x)) if angles is None else angles
         x, after = (interpolated(curve.x, angles + turn) for turn in (0.0, curve.rotation))
         return in_lanes(_observe, self.motion(curve.p), x, after)
 
     def cocycle(self, curve: Curve) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivative over a period and the direction along the curve, at each node. Both
-        are those of the state just before the first event, at a given clock."""
+        are those of the scaled state just before the first event, at a given clock."""
         problem, slopes = self.problem, derivative(curve.x)
         begin, matrices = len(problem.events), self.observe(curve).monodromy
         along = slopes[:, begin : begin + problem.states]
         if problem.autonomous:
             ends = np.einsum("jab,jb->ja", matrices, along)
-            along = interpolated(ends, np.arange(len(ends)) / len(ends) - curve.rotation)
+            along = interpolated(ends, angles_of(len(ends)) - curve.rotation)
         elif problem.events:
             along = along - slopes[:, :1] * in_lanes(_rates, self.motion(curve.p), curve.x)
-        return matrices, along
+        sizes = np.asarray(problem.sizes)[1:]
+        return matrices * sizes / sizes[:, None], along / sizes
 
     def on_section(self, curve: Curve, angles: np.ndarray) -> np.ndarray:
         """Return the states on the section at some angles, (angles, states)."""
@@ -243,9 +242,9 @@ class Equations:
             move, tangent = (self.unpack(row, len(curve.x)) for row in moves)
             size = max(np.abs(move.x / self.scale).max(), *np.abs(moves[0][move.x.size :]))
             share = min(1.0, _LONGEST / size) if size > 0 else 1.0
-            curve = Curve(*(a + share * b for a, b in zip(curve, move, strict=True)))  # pyright: ignore
-            if size <= _TOLERANCE or (before <= _ROUNDED and size >= before):
-                return Solved(curve, float(size), count, tangent)
+            curve = curve.plus(share, move)
+            if size <= _TOLERANCE or (before <= ROUGHLY and size >= before):
+                return Solved(curve, count, tangent)
             before = size
         return None
 
@@ -253,26 +252,21 @@ class Equations:
         self, curve: Curve, conditions: Sequence[Condition], is_cycle: bool
     ) -> np.ndarray | None:
         """Return Newton's correction and the tangent (see `Solved`), as rows of unknowns."""
-        (count, width), row = curve.x.shape, self.pack(curve)
-        shift, slope = _circulant(count, curve.rotation)
+        count, total = len(curve.x), curve.x.size
         if is_cycle:
-            shift, slope = np.roll(np.eye(count), 1, axis=1), 0 * slope
-            conditions = [self._value_of(curve, count * width, curve.rotation), *conditions]
-        arguments = curve.x, shift @ curve.x, np.tile(curve.p, (count, 1))
-        residual, columns = in_lanes(_linearize, self.problem, *arguments)
-        unit = self.scale * np.sqrt(count)
-        columns = columns * np.concatenate([unit, unit, self.widths])
-        rows = np.abs(columns).max(axis=2)
-        rows = np.where(rows > 0, rows, 1.0)
-        columns, residual = columns / rows[..., None], residual / rows
-        own, after, by_p = np.split(columns, [width, 2 * width], axis=2)
+            shift, slope = np.roll(np.eye(count), 1, axis=1), 0 * curve.x
+            conditions = [self._value_of(curve, total, curve.rotation), *conditions]
+        else:
+            shift = interpolated(np.eye(count), angles_of(count) + curve.rotation)
+            slope = shift @ derivative(curve.x)
+        own, after, by_p, residual = self._linearized(curve, shift @ curve.x)
         matrix = np.einsum("jab,ji->jaib", after, shift)
         matrix[np.arange(count), :, np.arange(count)] += own
-        by_rotation = np.einsum("jab,jb->ja", after, slope @ (curve.x / unit))
-        total = count * width
+        by_rotation = np.einsum("jab,jb->ja", after, slope / (self.scale * np.sqrt(count)))
         blocks = matrix.reshape(total, total), by_rotation.reshape(total, 1)
         left = np.hstack([*blocks, by_p.reshape(total, len(curve.p))])
         left = np.vstack([left, *(coefficients for coefficients, _ in conditions)])
+        row = self.pack(curve)
         misses = [coefficients @ row - value for coefficients, value in conditions]
         right = np.append(residual.ravel(), misses)
         if not (np.isfinite(left).all() and np.isfinite(right).all()):
@@ -282,6 +276,15 @@ class Equations:
         except np.linalg.LinAlgError:
             return None
         return moves if np.isfinite(moves).all() else None
+
+    def _linearized(self, curve: Curve, following: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the derivatives with respect to the scaled unknowns (as packed) of each row, of
+        that which follows it, and to the parameters; and the residuals."""
+        (count, width), units = curve.x.shape, self.scale * np.sqrt(len(curve.x))
+        shared = self.problem, np.concatenate([units, units, self.widths])
+        p = np.tile(curve.p, (count, 1))
+        columns, residual = in_lanes(_linearize, shared, curve.x, following, p)
+        return *np.split(columns, [width, 2 * width], axis=2), residual
 
     def _value_of(self, curve: Curve, index: int, value: float) -> Condition:
         """Return the condition that an unknown of the row has a value."""
@@ -308,6 +311,12 @@ class Equations:
         row = self.pack(tangent)
         return row / np.linalg.norm(row)
 
+    def directed(self, solved: Solved, before: Curve) -> Solved:
+        """Return a solution with its tangent of unit length, in the direction of another one."""
+        row, nodes = self.unit(solved.tangent), len(solved.curve.x)
+        sense = np.sign(row @ self.pack(before.with_nodes(nodes)))
+        return solved._replace(tangent=self.unpack(sense * row, nodes))
+
     def solve_near(self, guess: Curve, value: float | None = None) -> Solved | None:
         """Solve at the guess's parameters, or at another value of the last one."""
         conditions = [self.phase(guess)]
@@ -317,15 +326,17 @@ class Equations:
             conditions.append(self._value_of(guess, -1, value / self.widths[-1]))
         return self.solve(guess, conditions)
 
-    def refined(self, solved: Solved, tail: float, most: int) -> Solved | None:
+    def refined(self, solved: Solved | None, most: int) -> Solved | None:
         """Double the nodes until the tail is small, or more than `most` were needed; `None` if the
-        equations are not solved with more nodes."""
-        found: Solved | None = solved
-        while found and self.tail(found.curve) > tail and 2 * len(found.curve.x) - 1 <= most:
-            finer = found.curve.with_nodes(2 * len(found.curve.x) - 1)
-            held = [self.across(finer, found.tangent)] if len(finer.p) else []
-            found = self.solve(finer, [self.phase(finer), *held])
-        return found
+        equations are not solved, then or before."""
+        while solved and self.tail(solved.curve) > CORRECTED:
+            nodes = 2 * len(solved.curve.x) - 1
+            if nodes > most:
+                break
+            finer = solved.curve.with_nodes(nodes)
+            held = [self.across(finer, solved.tangent)] if len(finer.p) else []
+            solved = self.solve(finer, [self.phase(finer), *held])
+        return solved
 
     def rotating_mode(self, point: Curve) -> tuple[float, np.ndarray]:
         """Return rotation number and complex mode of the infinitesimal curves around a periodic
@@ -333,13 +344,8 @@ class Equations:
         """
         from scipy.linalg import eig  # slow to load
 
-        width, units = len(self.scale), [self.scale, self.scale, self.widths]
-        columns = in_lanes(_linearize, self.problem, point.x, point.x, point.p[None])[1][0]
-        columns = columns * np.concatenate(units)
-        columns = columns / np.abs(columns).max(axis=1, keepdims=True)
-        pairs: Any = eig(columns[:, :width], -columns[:, width : 2 * width])
-        values = pairs[0]
-        turns = np.isfinite(values) & (np.imag(values) > _ROUNDED)
-        distance = np.where(turns, np.abs(np.abs(values) - 1), np.inf)
-        i = int(np.argmin(distance))
-        return float(np.angle(values[i]) / (2 * np.pi)), pairs[1][:, i]
+        own, after, *_ = self._linearized(point, point.x)
+        values, vectors = eig(own[0], -after[0])  # pyright: ignore
+        turns = np.isfinite(values) & (np.imag(values) > ROUGHLY)
+        i = int(np.argmin(np.where(turns, np.abs(np.abs(values) - 1), np.inf)))
+        return float(np.angle(values[i]) / (2 * np.pi)), vectors[:, i]

@@ -17,17 +17,11 @@ from .._types import Flag, Scalar, State, Vector
 from ..flow import Rates, SmoothMachine, guard_rates
 from ..machine import event_of, events_of, guard_of, has_velocity, section_number, stops_of
 from .flight import Flight, force_on
+from .tolerances import EXACT, ROUNDING
 
 # Newton's method has converged if it ends this close to a turn (as a share of the step): a choice.
 # The remainder changes the height in second order and is subtracted.
 _TURNED = 1e-3
-
-# A body has stopped at an event if its speed there is this share of its greatest since the last
-# event: a choice, above the residuals of orbits.
-_STOPPED = 1e-9
-
-# A guard is zero within this share of its largest modulus along a flight: a choice.
-_ROUNDED = 1e-12
 
 
 class Path(NamedTuple):
@@ -179,7 +173,7 @@ def turning_points(path: Path) -> tuple[list[_Turns], list[_Margins]]:
             guard_value = lambda s, u, guard=guard: guard.value(flight, s, flight.unravel(u))
             value = jax.vmap(guard_value)(path.places, path.states)
             # Just after the event itself it is zero, to rounding of either sign.
-            below = -_ROUNDED * jnp.max(jnp.abs(value))
+            below = -EXACT * jnp.max(jnp.abs(value))
             facing = facing & turn.happens & (jax.lax.cummin(value) < below)
         margins.append((jnp.where(facing, -turn.height, jnp.inf), turn.place))
     return bodies, margins
@@ -194,7 +188,7 @@ def _turns_in(path: Path, watched: _Quantity) -> _Turns:
     # rounding of either sign, so both must have the same sign.
     end = v[0] if closed else watched.rate(flight, places[-1] + h, last)
     if isinstance(watched, _Body) and not closed:  # friction may act from its turn on
-        end = jnp.where(jnp.abs(end) <= _STOPPED * jnp.max(jnp.abs(v)), 0.0, end)
+        end = jnp.where(jnp.abs(end) <= ROUNDING * jnp.max(jnp.abs(v)), 0.0, end)
     v1 = jnp.concatenate([v[1:], end[None]])
     return jax.vmap(lambda *x: flight.once(partial(_turn, watched), (h, *x)))(places, states, v, v1)
 

@@ -20,11 +20,13 @@ from .._checks import count, from_host, given_number
 from .._messages import Interrupted, ReportProgress, at_work, warn
 from .._types import Vector
 from ..machine import nearest_images
-from .corrector import Step, advance, distance_along, locate_zero, on_host, step_error
+from .corrector import Step, advance, distance_along, on_host, step_error
 from .edit_events import half_difference, repeats_from
 from .equations import Shooting
 from .from_orbit import COARSE, steps_depend_on_motion, with_finer_steps, with_grown_sizes
+from .locate import locate_zero
 from .special import Point
+from .tolerances import EXACT, LOCATED, SAME
 
 # Reasons to end of every curve: Ctrl-C was pressed, the corrector fails, the curve closes, a bound.
 INTERRUPTED, STALLED, CLOSED, BOUNDS = "interrupted", "stalled", "closed", "bounds"
@@ -34,13 +36,10 @@ SHORTER = "shorter"
 
 # The numbers below are choices where no measurement is given.
 
-# The tangents of two points close to each other on one curve have at least this product.
+# The tangents of two points close to each other on one curve have at least this product: they turn
+# by less than 26°. A step stays within half that angle of its first tangent; one with a smaller
+# cosine than this has reached another curve, beyond a jump of the equations, or another part.
 SAME_CURVE = 0.9
-
-# A step with a tangent that turns by less than 26° (as the walk requires) stays within half that
-# angle of its first tangent. A step with a smaller cosine than this has reached another curve,
-# beyond a jump of the equations, or another part. Steps up to the second number are rounding.
-_LEAST_COSINE, _TINY = 0.9, 1e-6
 
 # A walk stalls if its steps must be shorter than this share of the longest. The shortest
 # steps that the branches of the tests need are 2e-3 of it.
@@ -59,14 +58,6 @@ _WARN_ABOVE = 1e-8
 
 # A curve begins at the zero of a test that is at most this share of its value a step further on.
 _ZERO_AT_START = 1e-7
-
-# A walk that stalls this close to a bound (in the parameter's scale) is extended to it. This is a
-# few times the remainder of its shortest steps.
-_NEAR_BOUND = 1e-6
-
-# A parameter this close to its bound (in its scale) is at it, to rounding: a choice, below the
-# corrector's tolerance.
-_ON_BOUND = 1e-12
 
 
 class Ending(NamedTuple):
@@ -117,7 +108,7 @@ class Table(abc.ABC):
     def advance(self, x: Any, tangent: Any, length: Any) -> Step:
         new = advance(self.problem, x, tangent, length)
         distance = float(np.linalg.norm((new.x - np.asarray(x)) / self.scale))
-        deviates = distance > _TINY and not abs(length) >= _LEAST_COSINE * distance
+        deviates = distance > LOCATED and not abs(length) >= SAME_CURVE * distance
         return new._replace(good=np.asarray(False)) if deviates else new
 
     def locate_zero(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
@@ -134,7 +125,7 @@ class Table(abc.ABC):
         x = np.array(step.x)
         for i, ends in enumerate(self.bounds, -len(self.bounds)):
             for bound in ends:
-                x[i] = bound if abs(x[i] - bound) < _ON_BOUND * self.scale[i] else x[i]
+                x[i] = bound if abs(x[i] - bound) < EXACT * self.scale[i] else x[i]
         return step._replace(x=x)
 
     def image_difference(self, step: Step) -> np.ndarray:
@@ -288,7 +279,7 @@ class _Walk:
         for i, ends in enumerate(table.bounds, -len(table.bounds)):
             for bound in ends:
                 length = (bound - float(last.x[i])) / table.scale[i]
-                if abs(length) < _NEAR_BOUND:
+                if abs(length) < LOCATED:  # a few times the remainder of the shortest steps
                     at = advance(table.problem, last.x, axes[i], length)
                     if bool(at.good):
                         return Ending(at, BOUNDS)
@@ -353,7 +344,7 @@ def bound_rows(table: Table) -> list[Event]:
             return sense * (float(step.x[i]) - bound) / float(table.scale[i])
 
         def ending(at: Step) -> Ending:
-            return Ending(at, BOUNDS if abs(distance(at)) < _NEAR_BOUND else SHORTER)
+            return Ending(at, BOUNDS if abs(distance(at)) < LOCATED else SHORTER)
 
         return Event(distance, ending)
 
@@ -361,9 +352,9 @@ def bound_rows(table: Table) -> list[Event]:
     return [row(i, *end) for i, (low, high) in intervals for end in ((low, 1.0), (high, -1.0))]
 
 
-# Two motions are the same within this distance (scaled), if their tangents differ by less than the
-# second number. Choices: 10⁴ times the corrector's error, far below the distance of two passages.
-_SAME_MOTION, _SAME_TANGENT = 1e-7, 1e-2
+# Two solutions are the same motion (`SAME`) if their tangents, too, differ by less than this: a
+# choice.
+_SAME_TANGENT = 1e-2
 
 # A curve is away from its first point beyond so many lengths of its step, else near it: a choice.
 _NEAR = 2.0
@@ -416,7 +407,7 @@ class Closing:
                 return float(np.dot(tangent, (start - step.x) / self.table.scale))
 
             def ending(at: Step, start=start, tangent=tangent, point=point) -> Ending | None:
-                same = self._distance(at, start) < _SAME_MOTION
+                same = self._distance(at, start) < SAME
                 if not same or np.linalg.norm(at.tangent - tangent) >= _SAME_TANGENT:
                     return None
                 return Ending(at if point is None else point._replace(tangent=at.tangent), CLOSED)
@@ -434,7 +425,7 @@ class Closing:
         others = ((other, rate / scale) for other, rate in found)
         self.starts = [
             (first.x, np.asarray(first.tangent)),
-            *(other for other in others if self._distance(first, other[0]) > _SAME_MOTION),
+            *(other for other in others if self._distance(first, other[0]) > SAME),
         ]
 
     def _cycle_length(self, step: Step) -> float:

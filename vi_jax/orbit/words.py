@@ -6,9 +6,7 @@ from ..machine import RigidStop, SoftStop, clock_in_words, stops_of
 from .corrector import Step, since_section
 from .equations import Shooting
 from .flight import Event
-
-# Events closer than this coincide (a cycle is 2π): a choice, above the errors of places.
-TOGETHER = 1e-6
+from .tolerances import LOCATED
 
 
 def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
@@ -24,7 +22,7 @@ def coincidence_in_words(problem: Shooting, at: Step) -> str:
         after = problem.after(machine, leg, s, u)
         sizes.append(problem.guard_sizes(problem.flight(machine, leg), s, after))
     margins = problem.order_margins(machine, clock, problem.lengths(x), states, sizes)
-    pairs = ((i, n) for margin, i, n in margins if float(margin) < TOGETHER * problem.radian)
+    pairs = ((i, n) for margin, i, n in margins if float(margin) < LOCATED * problem.radian)
     i, other = next(pairs, (0, None))  # the first in the motion: the least is so by rounding
     if other is not None:
         names = [event.name_on(problem.machine) for event in (problem.events[i], Event(other))]

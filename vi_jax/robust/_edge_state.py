@@ -170,8 +170,8 @@ def _follow_pair(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
     parts = []
     for _ in range(_PIECES):
         both = settling.section_states(pair, RECORDED)
-        both[1] = settling.near(both[1], both[0])
-        separated = np.flatnonzero(~(settling.distance_to(both[1], both[0]) <= _APART))  # or NaN
+        both[1] = settling.motion.near(both[1], both[0])
+        separated = np.flatnonzero(~(settling.motion.between(both[1], both[0]) <= _APART))  # or NaN
         end = separated[0] if separated.size else RECORDED
         end = end if np.isfinite(both[:, end]).all() else end - 1
         parts.append(both[:, 1 : end + 1].mean(axis=0))
@@ -186,7 +186,8 @@ def _recurrence(
 ) -> tuple[Row, int] | None:
     """Return the last state if the motion has returned near to it, and the fewest cycles."""
     last = section_states[-1]
-    near = np.flatnonzero(settling.distance_to(section_states[:-1], last)[::-1][:longest] <= limit)
+    distances = settling.motion.between(section_states[:-1], last)
+    near = np.flatnonzero(distances[::-1][:longest] <= limit)
     return (last, int(near[0]) + 1) if near.size else None
 
 
@@ -194,14 +195,14 @@ def _described(settling: Settling, section_states: list[Rows], orbit: Orbit | No
     rows = (
         np.concatenate(section_states)
         if section_states
-        else np.zeros((0, settling.motion.shape[1]))
+        else np.zeros((0, settling.motion.states.shape[1]))
     )
     if orbit is not None:
         outside = int(np.sum(np.abs(np.asarray(orbit.multipliers)) > 1))
         kind = "saddle" if outside == 1 else "unstable"
     else:
         late = rows[len(rows) // 4 :]
-        kind = "chaotic" if _chaotic(settling.near(late, late[-1:])) else "irregular"
+        kind = "chaotic" if _chaotic(settling.motion.near(late, late[-1:])) else "irregular"
     sections = jax.vmap(settling.state)(jnp.asarray(rows))
     return EdgeState(orbit, kind, sections, settling.the_map.machine)
 

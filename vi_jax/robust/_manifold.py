@@ -142,11 +142,11 @@ class _Saddle:
         the_map = cycle_map(orbit.machine, method=orbit.method)
         place = in_row(without_modes(orbit.state))
         self.map = Settling(the_map, without_modes(orbit.state), place[None], 1, 1.0)
-        unit = self.map.unit
-        self.place = place / unit
+        self.near, self.unit = self.map.motion.near, self.map.motion.sizes
+        self.place = place / self.unit
         period = int(orbit.cycles)
         whole = cycle_map(orbit.machine, period, method=orbit.method)
-        jacobian = np.asarray(whole.jacobian(orbit.state)) * unit / unit[:, None]
+        jacobian = np.asarray(whole.jacobian(orbit.state)) * self.unit / self.unit[:, None]
         values, right = np.linalg.eig(jacobian)
         order = np.argsort(-np.abs(values))
         growth = np.real(values[order])
@@ -158,13 +158,13 @@ class _Saddle:
         self.period, self.growth = turns * period, float(np.abs(growth[0]) ** turns)
 
     def states_after(self, rows: Rows, periods: int) -> Rows:
-        return self.map.states_after(rows * self.map.unit, periods * self.period) / self.map.unit
+        return self.map.states_after(rows * self.unit, periods * self.period) / self.unit
 
     def states(self, parts: list[Rows]) -> Rows:
         """Return points of a curve in original units, with NaN rows where an angle jumps a turn."""
-        rows = np.concatenate(parts) * self.map.unit
-        rows = self.map.near(rows, np.zeros_like(rows))
-        jumps = np.abs(self.map.near(rows[1:], rows[:-1]) - rows[1:]) > 1
+        rows = np.concatenate(parts) * self.unit
+        rows = self.near(rows, np.zeros_like(rows))
+        jumps = np.abs(self.near(rows[1:], rows[:-1]) - rows[1:]) > 1
         return np.insert(rows, np.flatnonzero(jumps.any(axis=1)) + 1, np.nan, axis=0)
 
     def side_of(self, rows: Rows, distance: float) -> tuple[Row, Bool[np.ndarray, " _"]]:
@@ -172,7 +172,7 @@ class _Saddle:
         largest = np.log(_GROWTH) / np.log(self.growth)
         periods = np.clip(np.log(_REACH / distance) / np.log(self.growth), 1, max(largest, 1))
         images = self.states_after(rows, int(periods))
-        diff = self.map.near(images, self.place) - self.place
+        diff = self.near(images, self.place) - self.place
         return diff @ self.across, np.all(np.abs(diff) <= _FAR * (1 + np.abs(self.place)), axis=1)
 
 
@@ -221,7 +221,7 @@ def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pi
     while reached < length and periods < 400:
         periods += 1
         rows, connected = _image_of_stretch(saddle, begin, periods, spacing)
-        near = saddle.map.near(rows[1:], rows[:-1])
+        near = saddle.near(rows[1:], rows[:-1])
         steps = np.linalg.norm(near - rows[:-1], axis=1)
         steps[~connected] = 0.0
         arc_length = reached + np.concatenate([[0.0], np.cumsum(steps)])
@@ -245,7 +245,7 @@ def _image_of_stretch(
     parts = np.linspace(0, 1, 9)
     rows = images(parts)
     while True:
-        steps = saddle.map.near(rows[1:], rows[:-1]) - rows[:-1]
+        steps = saddle.near(rows[1:], rows[:-1]) - rows[:-1]
         sizes = np.linalg.norm(steps, axis=1)
         wide = ~(sizes <= spacing)
         inner = np.sum(steps[1:] * steps[:-1], axis=1)

@@ -148,7 +148,7 @@ def first_exits(
     rays = ray_directions(directions, kick.size, seed)
     reach = largest
     if reach is None:
-        sizes = (settling.unit + np.abs(kick.start))[list(kick.places)]
+        sizes = (settling.motion.sizes + np.abs(kick.start))[list(kick.places)]
         reach = float(np.max(kick.weights * sizes)) / 4
     found = exits(settling, kick, rays, 0.0, reach, points)
     for _ in range(_DOUBLINGS if largest is None else 0):
@@ -167,15 +167,22 @@ def first_exits(
     return narrowed(settling, kick, found, _COARSE)
 
 
-def nearest_first(found: Exits, most: int) -> list[int]:
-    """Return the rays with earlier exits than their neighbours', the earliest first, at most so
-    many. A ray has two neighbours around a circle, three per dimension (a choice) in more."""
+def nearest_first(found: Exits, most: int) -> list[tuple[Row, float]]:
+    """Return directions and radii of the exits that are earlier than their neighbours', the
+    earliest first, at most so many. A ray has two neighbours around a circle, three per dimension
+    (a choice) in more."""
     units, size = found.directions, found.directions.shape[1]
     neighbours = 3 * size if size > 2 else 2 * (size - 1)
     near = np.argsort(-(units @ units.T), axis=1, kind="stable")[:, 1 : neighbours + 1]
     least = found.outside <= np.min(found.outside[near], axis=1, initial=np.inf)
     order = np.argsort(found.outside, kind="stable")
-    return [int(i) for i in order if least[i]][:most]
+    best = [int(i) for i in order if least[i]][:most]
+    if not best or not np.isfinite(found.outside[best[0]]):
+        raise ValueError(
+            "No kick leads elsewhere, of those that `components`, `bounds` and `largest` allow: "
+            "the motion came back from all of them."
+        )
+    return [(units[i], float(found.outside[i])) for i in best]
 
 
 def refine_direction(
@@ -244,7 +251,7 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
     growth = float(np.max(np.abs(np.asarray(saddle.multipliers))))
     longest = int(np.clip(np.log(1e14) / np.log(growth), 8, 400))
     section_states = settling.section_states(kick.rows(z)[None], longest * period)[0]
-    distances = settling.distance_to(section_states[1:, None], rows)
+    distances = settling.motion.between(section_states[1:, None], rows)
     near = np.flatnonzero(distances.min(axis=1) <= _NEAR_SADDLE)
     if not near.size:
         return None
@@ -254,7 +261,7 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
         numbers = (jnp.asarray(x) for x in (kick.rows(z), cycles, settling.begin))
         ends, jacobian = images(settling.the_map, settling.like, *numbers)
         slope = normals[place] @ np.asarray(jacobian)[:, :, list(kick.places)]
-        offsets = settling.near(np.asarray(ends), rows[place]) - rows[place]
+        offsets = settling.motion.near(np.asarray(ends), rows[place]) - rows[place]
         return offsets @ normals[place], slope / kick.weights
 
     first, before, last = z, None, np.inf
@@ -479,14 +486,7 @@ def minimal_kick(
             kick = dataclasses.replace(kick, start=start)
         rays = first_exits(settling, kick, directions, points, largest, seed)
         angle = 2 * np.pi / directions ** (1 / max(1, kick.size - 1))  # between neighbours
-        best = nearest_first(rays, candidates)
-        if not best or not np.isfinite(rays.outside[best[0]]):
-            raise ValueError(
-                "No kick leads elsewhere, of those that `components`, `bounds` and `largest` "
-                "allow: the motion came back from all of them."
-            )
-        for ray in best:
-            unit, radius = rays.directions[ray], float(rays.outside[ray])
+        for unit, radius in nearest_first(rays, candidates):
             found = _exact(settling, kick, unit, radius, angle, longest, seed)
             new = _described(settling, kick, found, longest, cycle, phase)
             if all(_distance(new, old) > _SAME for old in kicks):

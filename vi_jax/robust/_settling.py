@@ -25,11 +25,11 @@ from ..machine import (
     in_rows,
     is_autonomous,
     modes_of,
-    nearest_images,
     without_modes,
 )
 from ..orbit import (
     CycleMap,
+    MotionSections,
     Orbit,
     check_multipliers,
     cycle_map,
@@ -70,12 +70,11 @@ class Settling:
     elsewhere.
     """
 
-    def __init__(self, the_map: CycleMap, like: State, motion: Rows, settle: int, tolerance: float):
-        self.the_map, self.like, self.motion = the_map, like, motion
-        self.settle, self.tolerance = settle, tolerance
-        self.unit = sizes_on_host(the_map.machine, like, motion)
-        """The unit of each component in all comparisons of states."""
-        self.angles = angles_in(the_map.machine, like)
+    def __init__(self, the_map: CycleMap, like: State, rows: Rows, settle: int, tolerance: float):
+        self.the_map, self.like, self.settle, self.tolerance = the_map, like, settle, tolerance
+        sizes, angles = sizes_on_host(the_map.machine, like, rows), angles_in(the_map.machine, like)
+        self.motion = MotionSections(rows, np.zeros((len(rows), 0)), sizes, angles)
+        """The motion, which also tells the distance of states in all comparisons."""
         self.begin = 0.0
         """Time of the starts after the section, by the clock of a machine with a drive."""
         self._judged_so_far: list[int] = []
@@ -95,18 +94,6 @@ class Settling:
     def state(self, row: object) -> State:
         return ravel_pytree(self.like)[1](jnp.asarray(row))
 
-    def near(self, states: np.ndarray, references: np.ndarray) -> np.ndarray:
-        """Move states by whole turns of their angles to where they are nearest to others."""
-        return nearest_images(self.angles, states, references)
-
-    def distance_to(self, states: np.ndarray, references: np.ndarray) -> np.ndarray:
-        """Return the distance of states from others, up to whole turns, see `orbit.distance`."""
-        return distance(self.near(states, references), references, self.unit)
-
-    def distance(self, rows: Rows) -> Float[np.ndarray, " lanes"]:
-        """Return the distance of section states from the motion's nearest one."""
-        return self.distance_to(rows[:, None], self.motion).min(axis=1)
-
     def judge(self, rows: Rows) -> Int[np.ndarray, " lanes"]:
         """Return `RETURNS`, `ELSEWHERE` or `INADMISSIBLE` for each start."""
         return np.concatenate([self._judged(*part) for part in _padded_parts(rows)])
@@ -116,7 +103,7 @@ class Settling:
         self._judged_so_far.append(count)
         self.report(count)
         # States on the motion need not return to it; an equilibrium meets no section at all.
-        is_away = self.distance(rows) > 0
+        is_away = self.motion.distance(rows) > 0
         verdict = np.where(is_away | (self.begin > 0), ELSEWHERE, RETURNS)
         is_running &= verdict == ELSEWHERE
         done, step = 0, 1
@@ -127,11 +114,11 @@ class Settling:
             if not done:
                 verdict[is_running & bad_start] = INADMISSIBLE
             # A repeating state has settled: more cycles cost time, and end an equilibrium in noise.
-            moves = (self.distance_to(later, rows) > _UNCHANGED) | (begin > 0)
+            moves = (self.motion.between(later, rows) > _UNCHANGED) | (begin > 0)
             rows = np.where((is_running & good)[:, None], later, rows)
             is_running &= good
             returned = is_running.copy()
-            returned[is_running] = self.distance(rows[is_running]) <= self.tolerance
+            returned[is_running] = self.motion.distance(rows[is_running]) <= self.tolerance
             verdict[returned] = RETURNS
             is_running &= ~returned & moves
             done += step
@@ -178,7 +165,7 @@ class Settling:
         """Return two starts between two others, `width` apart (by the motion's size), one that
         returns and one that does not. Fifteen points between them are judged in a round."""
         parts = np.linspace(0, 1, 17)[1:-1, None]
-        while distance(outside, inside, self.unit) > width:
+        while distance(outside, inside, self.motion.sizes) > width:
             between = inside + parts * (outside - inside)
             (place,), _ = self.first_change(between[None])
             ends = np.concatenate([inside[None], between, outside[None]])
@@ -194,7 +181,7 @@ class Settling:
             return None
         rows = self.starting_at(0.0).section_states(last, 2 * longest)[0]
         for period in range(1, longest + 1):
-            if self.distance_to(rows[:-period], rows[period:]).max() <= _SAME:
+            if self.motion.between(rows[:-period], rows[period:]).max() <= _SAME:
                 return rows[:period]
         return None
 
@@ -210,15 +197,15 @@ class Settling:
         if not bool(orbit.successful):
             return None
         sections = np.asarray(in_rows(orbit.sections))
-        return orbit if self.distance_to(row, sections).min() <= near else None
+        return orbit if self.motion.between(row, sections).min() <= near else None
 
     def at_phase(self, start: Row, phase: float) -> tuple["Settling", Row]:
         """Return a classifier of starts `phase` after a section state of the motion, and that
         state."""
         machine, method = self.the_map.machine, self.the_map.method
-        if bool(is_equilibrium(machine, self.state(start), machine.cycle, self.unit)):
+        if bool(is_equilibrium(machine, self.state(start), machine.cycle, self.motion.sizes)):
             raise ValueError("Argument `phase` must be 0 for an equilibrium, which does not move.")
-        row = self.motion[self.distance_to(start, self.motion).argmin()]
+        row = self.motion.states[self.motion.between(start, self.motion.states).argmin()]
         state, autonomous = self.state(row), is_autonomous(machine, self.like)
         length = float(jnp.asarray(machine.cycle))
         if autonomous:
@@ -285,7 +272,7 @@ def settling_on(
         return Settling(the_map, like, rows, settle, tolerance), rows[cycle % len(rows)]
     start = in_row(like)
     settling = Settling(the_map, like, start[None], settle, tolerance)
-    if bool(is_equilibrium(the_map.machine, like, the_map.machine.cycle, settling.unit)):
+    if bool(is_equilibrium(the_map.machine, like, the_map.machine.cycle, settling.motion.sizes)):
         return settling, start
     rows = settling.settled_rows(start, longest)
     if rows is None:

@@ -1,5 +1,6 @@
 """`basins`: the motion that each start settles on; `integrity_profile`: the erosion of basins."""
 
+import dataclasses
 import difflib
 import inspect
 import itertools
@@ -49,7 +50,7 @@ from ..machine import (
     with_modes,
     without_modes,
 )
-from ..orbit import MotionSections
+from ..orbit import MotionSections, index_of
 from . import _geometry as geometry
 from ._scan import LanesFailed, interrupted, scan
 from .measures import CODES, REGIMES, Regime, Sections, flags, legends
@@ -279,6 +280,118 @@ class _Mark(Sections):
         return {name: x[highest] for name, x in (super().__call__(machine, run) | modes).items()}
 
 
+@dataclasses.dataclass(frozen=True)
+class _Mapper:
+    """A mapper from starts to the motions on which they settle, with the arguments of `basins`."""
+
+    start: State
+    """The components of the starts that do not vary; by default those of the machine's own."""
+    settle: int
+    longest: int
+    tolerance: float | None
+    apart: float
+    method: AbstractMethod
+
+    def __post_init__(self):
+        given_number("apart", self.apart, low=0.0, open_low=True)
+
+    def begin_of(self, machine: AbstractMachine) -> State:
+        return machine.start() if self.start is None else self.start
+
+    def scan(
+        self, machine: AbstractMachine, axes: Mapping[str, Any], **options: Any
+    ) -> "xr.Dataset":
+        """Simulate from starts on axes until their motions have settled."""
+        measures = Regime(longest=self.longest, tolerance=self.tolerance), _Mark(self.longest)
+        given: Any = {"start": self.start, "settle": self.settle, "method": self.method}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LanesFailed)
+            return scan(machine, axes, measure=measures, **given, **options)
+
+    def basins_in(self, data: "xr.Dataset", machine: AbstractMachine) -> Basins:
+        """Return the basins in the result of `scan`."""
+        begin = self.begin_of(machine)
+        label, motions = self._sorted(data, machine)
+        impacts = np.asarray(data["impacts"]).ravel()
+        attractors = []
+        for number, motion in enumerate(motions):
+            on_motion = label == number
+            share = float(np.mean(on_motion))
+            attractors.append(Attractor(
+                label=number,
+                period=len(motion.states),
+                impacts=float(np.median(impacts[on_motion])),
+                sections=dict(zip(components(begin), motion.states.T, strict=True)),
+                modes=tuple(motion.modes.T),
+                starts=int(np.sum(on_motion)),
+                fraction=share,
+                error=math.sqrt(share * (1 - share) / label.size),
+            ))  # fmt: skip
+        parts = {name: float(np.mean(label == number)) for name, number in CODES.items()}
+        about = {"long_name": "motion that the start settles on", **flags(CODES)}
+        about["at_stop"] = _edges_at_stop(data, machine, begin)
+        period = data["period"]
+        kind = np.min_scalar_type(-max(4, len(motions)))
+        data = data.assign(label=(period.dims, label.astype(kind).reshape(period.shape), about))
+        data.attrs |= legends(data)
+        return Basins(data, attractors, parts, machine)
+
+    def _sorted(
+        self, data: "xr.Dataset", machine: AbstractMachine
+    ) -> tuple[np.ndarray, list[MotionSections]]:
+        """Return the label of each lane, and each motion's sections, most lanes first."""
+        begin, period = self.begin_of(machine), np.asarray(data["period"]).ravel()
+        states, modes = _last_sections(data, machine, begin)
+        label = np.where(np.isin(period, list(REGIMES)), period, int(REGIMES.failed)).astype(int)
+        settled = np.flatnonzero(period > 0)
+        if not settled.size:
+            return label, []
+        axes = [START + name for name in components(begin)]
+        starts = [float(np.abs(data[x]).max()) if x in data.coords else 0.0 for x in axes]
+        unit = sizes_on_host(machine, begin, np.vstack([states[settled], starts]))
+        # Lanes on one motion lie in few cells. A result for one of them holds for all.
+        cells = np.floor(states[settled] / (unit * self.apart)).astype(np.int64)
+        cells = np.column_stack([period[settled].astype(np.int64), modes[settled], cells])
+        _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        motions: list[MotionSections] = []
+        motion_of_cell, angles = np.empty(first.size, int), angles_in(machine, begin)
+        for i, lane in enumerate(settled[first]):
+            cycles, here = int(period[lane]), (states[lane], modes[lane])
+            motion_of_cell[i] = index_of(motions, cycles, *here, self.apart)
+            if motion_of_cell[i] == len(motions):
+                sections = self._sections_from(data, machine, lane, cycles, *here)
+                motions.append(MotionSections(*sections, unit, angles))
+        found = motion_of_cell[inverse.ravel()]
+        order = np.argsort(-np.bincount(found), kind="stable")
+        label[settled] = np.argsort(order)[found]
+        return label, [motions[i] for i in order]
+
+    def _sections_from(
+        self, data: "xr.Dataset", machine: AbstractMachine, lane: int, cycles: int,
+        state: np.ndarray, modes: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Return states and modes on the sections of a lane's motion from its last state on."""
+        begin, settle = self.begin_of(machine), 0
+        values = dict(zip(components(begin), state, strict=True))
+        start = with_modes(with_leaves(without_modes(begin), values), tuple(modes))
+        if has_delays(machine):  # the state alone is not a point of the motion
+            start, settle = _start_of_lane(data, begin, lane), self.settle
+        # The same number of cycles for all periods, for one compiled program.
+        run = simulate(machine, start, self.longest, settle=settle, method=self.method)
+        modes_there = np.reshape(run.modes, (-1, self.longest + 1)).T
+        return np.asarray(in_rows(run.sections))[1 : cycles + 1], modes_there[1 : cycles + 1]
+
+
+def _last_sections(
+    data: "xr.Dataset", machine: AbstractMachine, begin: State
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the last section state of each lane and the machine's modes there, in rows."""
+    row = lambda name: np.asarray(data[name]).ravel()
+    states = np.stack([row(name) for name in components(begin)], axis=1)
+    modes = [row(f"mode_{i}") for i in range(len(modes_of(begun(machine, begin)) or ()))]
+    return states, np.reshape(modes, (-1, len(states))).T
+
+
 @warning_once
 def basins(
     machine: AbstractMachine,
@@ -323,55 +436,12 @@ def basins(
     """
     machine = machine_of(machine)
     _check_options(basins, options, ())
-    given_number("apart", apart, low=0.0, open_low=True)
-    begin = machine.start() if start is None else start
+    mapper = _Mapper(start, settle, longest, tolerance, apart, chosen(machine, method))
+    begin = mapper.begin_of(machine)
     axes = starts_in(region, machine, begin, resolution, samples, count("seed", seed))
-    method = chosen(machine, method)
-    data = _scan_starts(
-        machine, axes, longest, tolerance, start=start, settle=settle, method=method,
-        paired=samples is not None, progress=progress, **options,
-    )  # fmt: skip
-    kept = partial(interrupted, data, options.get("store"))
-    with at_work("sorting", kept, progress=False):
-        more: Any = {"apart": apart, "longest": longest, "method": method, "settle": settle}
-        return _find_basins(data, machine, begin, **more)
-
-
-def _find_basins(
-    data: "xr.Dataset",
-    machine: AbstractMachine,
-    begin: object,
-    *,
-    apart: float,
-    longest: int,
-    method: AbstractMethod,
-    settle: int,
-) -> Basins:
-    """Return the basins in the result of `_scan_starts`; `begin` has all other components."""
-    label, motions = _label_lanes(data, machine, begin, apart, longest, method, settle)
-    impacts = np.asarray(data["impacts"]).ravel()
-    attractors = []
-    for number, motion in enumerate(motions):
-        on_motion = label == number
-        share = float(np.mean(on_motion))
-        attractors.append(Attractor(
-            label=number,
-            period=len(motion.states),
-            impacts=float(np.median(impacts[on_motion])),
-            sections=dict(zip(components(begin), motion.states.T, strict=True)),
-            modes=tuple(motion.modes.T),
-            starts=int(np.sum(on_motion)),
-            fraction=share,
-            error=math.sqrt(share * (1 - share) / label.size),
-        ))  # fmt: skip
-    parts = {name: float(np.mean(label == number)) for name, number in CODES.items()}
-    about = {"long_name": "motion that the start settles on", **flags(CODES)}
-    about["at_stop"] = _edges_at_stop(data, machine, begin)
-    period = data["period"]
-    kind = np.min_scalar_type(-max(4, len(motions)))
-    data = data.assign(label=(period.dims, label.astype(kind).reshape(period.shape), about))
-    data.attrs |= legends(data)
-    return Basins(data, attractors, parts, machine)
+    data = mapper.scan(machine, axes, paired=samples is not None, progress=progress, **options)
+    with at_work("sorting", partial(interrupted, data, options.get("store")), progress=False):
+        return mapper.basins_in(data, machine)
 
 
 def _edges_at_stop(data: "xr.Dataset", machine: AbstractMachine, begin: object) -> list[str]:
@@ -416,19 +486,6 @@ def _check_options(
             raise TypeError(f"`{function}` has no argument `{name}`; {hint}.")
 
 
-def _scan_starts(
-    machine: AbstractMachine,
-    axes: Mapping[str, Any],
-    longest: int,
-    tolerance: float | None,
-    **options: Any,
-) -> "xr.Dataset":
-    measures = Regime(longest=longest, tolerance=tolerance), _Mark(longest)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LanesFailed)
-        return scan(machine, axes, measure=measures, **options)
-
-
 def starts_in(
     region: Mapping[str, tuple[float, float]],
     machine: AbstractMachine,
@@ -468,62 +525,9 @@ def starts_in(
     return axes
 
 
-def _label_lanes(
-    data: "xr.Dataset", machine: AbstractMachine, begin: object, apart: float, longest: int,
-    method: AbstractMethod, settle: int,
-) -> tuple[np.ndarray, list[MotionSections]]:  # fmt: skip
-    """Return labels, and each motion's sections, most lanes first."""
-    names, period = list(components(begin)), np.asarray(data["period"]).ravel()
-    states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)
-    of_modes = [f"mode_{i}" for i in range(len(modes_of(begun(machine, begin)) or ()))]
-    modes = np.array([np.asarray(data[name]).ravel() for name in of_modes]).reshape(-1, len(states))
-    modes = modes.T
-    label = np.where(np.isin(period, list(REGIMES)), period, int(REGIMES.failed)).astype(int)
-    settled = np.flatnonzero(period > 0)
-    if not settled.size:
-        return label, []
-    axis_names = [START + name for name in names]
-    starts = [float(np.abs(data[x]).max()) if x in data.coords else 0.0 for x in axis_names]
-    unit = sizes_on_host(machine, begin, np.vstack([states[settled], starts]))
-    # Lanes on one motion lie in few cells. A result for one of them holds for all.
-    cells = np.floor(states[settled] / (unit * apart)).astype(np.int64)
-    cells = np.column_stack([period[settled].astype(np.int64), modes[settled], cells])
-    _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    motions: list[MotionSections] = []
-    motion_of_cell, known = np.empty(first.size, int), {}
-    angles = angles_in(machine, begin)
-    for i, lane in enumerate(settled[first]):
-        p, state = int(period[lane]), states[lane]
-        # The motions of this period, and their indices.
-        same_period, numbers = known.get(p, (None, []))
-        if same_period is not None:
-            close = np.flatnonzero(same_period.passes(state, modes[lane], unit, angles, apart))
-            if close.size:
-                motion_of_cell[i] = numbers[close[0]]
-                continue
-        motion_of_cell[i] = len(motions)
-        section_state = with_leaves(without_modes(begin), dict(zip(names, state, strict=True)))
-        section_state = with_modes(section_state, tuple(modes[lane]))
-        # The same number of cycles for all periods, for one compiled program.
-        again = 0
-        if has_delays(machine):  # the state alone is not a point of the motion
-            section_state, again = _start_of_lane(data, begin, axis_names, lane), settle
-        run = simulate(machine, section_state, longest, settle=again, method=method)
-        rows = np.asarray(in_rows(run.sections))[1 : p + 1]
-        motions.append(MotionSections(rows, np.reshape(run.modes, (-1, longest + 1)).T[1 : p + 1]))
-        paths = [motions[n] for n in numbers] + motions[-1:]
-        known[p] = (
-            MotionSections(*map(np.stack, zip(*paths, strict=True))),
-            [*numbers, motion_of_cell[i]],
-        )
-    found = motion_of_cell[inverse.ravel()]
-    order = np.argsort(-np.bincount(found), kind="stable")
-    label[settled] = np.argsort(order)[found]
-    return label, [motions[i] for i in order]
-
-
-def _start_of_lane(data: "xr.Dataset", begin: State, names: list[str], lane: int) -> State:
+def _start_of_lane(data: "xr.Dataset", begin: State, lane: int) -> State:
     """Return the start of a lane of a scan over starts."""
+    names = [START + name for name in components(begin)]
     period, axes = data["period"], [name for name in names if name in data.coords]
     rows = {name: data[name].broadcast_like(period).transpose(*period.dims) for name in axes}
     return start_with(begin, {name: float(x.values.ravel()[lane]) for name, x in rows.items()})
@@ -655,29 +659,20 @@ def integrity_profile(
     machine = machine_of(machine)
     check_leaf(machine, parameter)
     _check_options(integrity_profile, options, ("samples", "seed"))
-    given_number("apart", apart, low=0.0, open_low=True)
     row = np.unique(axes_of({parameter: values}, "values")[parameter])
-    begin = machine.start() if start is None else start
-    axes = starts_in(region, machine, begin, resolution, None, 0)
+    mapper = _Mapper(start, settle, longest, tolerance, apart, chosen(machine, method))
+    axes = starts_in(region, machine, mapper.begin_of(machine), resolution, None, 0)
     for x in axes.values():
         count("resolution", x.size, least=2)
     _scales_along([*axes], scales)
-    method = chosen(machine, method)
-    data = _scan_starts(
-        machine, {parameter: row, **axes}, longest, tolerance, start=start, settle=settle,
-        method=method, progress=progress, **options,
-    )  # fmt: skip
+    data = mapper.scan(machine, {parameter: row, **axes}, progress=progress, **options)
     found, integrity = [], []
     kept = partial(interrupted, data, options.get("store"))
     with at_work("basins", kept, progress=progress, unit="value", total=row.size) as report:
         for i, value in enumerate(row):
-            current = with_leaf(machine, parameter, value)
-            begin = current.start() if start is None else start
             part = data.isel({parameter: i}).load()
-            more = {"apart": apart, "longest": longest, "method": method, "settle": settle}
-            result = _find_basins(part, current, begin, **more)
-            found.append(result)
-            integrity.append(result.integrity(scales=scales))
+            found.append(mapper.basins_in(part, with_leaf(machine, parameter, value)))
+            integrity.append(found[-1].integrity(scales=scales))
             report(1)
     return _profile(parameter, row, axes, found, integrity)
 

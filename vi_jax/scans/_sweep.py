@@ -1,6 +1,6 @@
 """`sweep`: a slow change of one parameter, with the motion carried from value to value."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -245,6 +245,39 @@ def sweep(
     """
     machine = machine_of(machine)
     check_leaf(machine, parameter)
+    measures = _measures_of_cycles(measure)
+    settle, cycles = count("settle", settle), count("cycles", cycles_for(measures, cycles), least=2)
+    progress = flag("progress", progress)
+    values, numbers = _values(values)
+    if max_steps is not None:
+        max_steps = count("max_steps", max_steps, least=1)
+    fits_records("cycles", values.size * cycles, 4)
+    rests = numbers is None or _may_rest_between(machine, parameter, numbers)
+    if start is None:
+        start = with_leaf(machine, parameter, values[0]).start()
+    method = chosen(machine, method)
+    regime = Regime(cycles // 2, tolerance=tolerance).under(method)
+    if clock is not None:
+        machine = in_clock(machine, clock)
+    start = _first_state(machine, parameter, values, numbers, start)
+    lane_noise, first = lane_noise_of(noise, key), without_modes(start)
+    if lane_noise is not None:
+        check_noise(machine, first, noise)
+
+    def step(carry, row):
+        return _sweep(
+            machine, parameter, row, carry, settle, cycles, method, rests, regime, measures,
+            max_steps, lane_noise, first,
+        )  # fmt: skip
+
+    # With noise, the index of the value is carried along: each has its own path.
+    carry = start if lane_noise is None else (start, jnp.uint32(0))
+    if values.size <= _AT_ONCE or not is_outermost(machine, values, start, regime, lane_noise):
+        return step(carry, values)[1]
+    return _in_pieces(step, carry, np.asarray(values), progress)
+
+
+def _measures_of_cycles(measure: Any) -> tuple[AbstractMeasure, ...]:
     measures = measures_of(measure)
     for each in measures:
         if each.instants or type(each).refine is not AbstractMeasure.refine:
@@ -252,53 +285,46 @@ def sweep(
                 "Argument `measure` must be of measures of the observed cycles alone, but a "
                 f"{type(each).__name__} needs more of each motion: use `scan`."
             )
-    settle, cycles = count("settle", settle), count("cycles", cycles_for(measures, cycles), least=2)
-    progress = flag("progress", progress)
-    values, numbers = _values(values)
-    if max_steps is not None:
-        max_steps = count("max_steps", max_steps, least=1)
-    fits_records("cycles", values.size * cycles, 4)
-    rests = True
-    if numbers is not None:
-        ends = [with_leaf(machine, parameter, value) for value in {numbers.min(), numbers.max()}]
-        for end in ends:
-            check_again(end)
-        rests = any(may_rest(end) for end in ends)
-    if start is None:
-        start = with_leaf(machine, parameter, values[0]).start()
-    method = chosen(machine, method)
-    regime = Regime(cycles // 2, tolerance=tolerance).under(method)
-    if clock is not None:
-        machine = in_clock(machine, clock)
+    return measures
+
+
+def _may_rest_between(machine: AbstractMachine, parameter: str, values: np.ndarray) -> bool:
+    """Return whether a body may rest at the least or the greatest value, both of them checked."""
+    ends = [with_leaf(machine, parameter, value) for value in {values.min(), values.max()}]
+    for end in ends:
+        check_again(end)
+    return any(may_rest(end) for end in ends)
+
+
+def _first_state(
+    machine: AbstractMachine, parameter: str, values: jax.Array, numbers: np.ndarray | None,
+    start: State,
+) -> State:  # fmt: skip
+    """Return the start of a sweep with its modes, checked at the first value."""
     start = replaced(start, convert_start(machine, without_modes(start)))
     check_reals("start", start)
     start = with_first_history(with_leaf(machine, parameter, values[0]), begun(machine, start))
     start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), start)
     if numbers is not None:
         check_start(with_leaf(machine, parameter, numbers[0]), without_modes(start))
-    lane_noise = lane_noise_of(noise, key)
-    if lane_noise is not None:
-        check_noise(machine, without_modes(start), noise)
-    first = without_modes(start)
-    options = (settle, cycles, method, rests, regime, measures, max_steps, lane_noise, first)
-    # With noise, the index of the value is carried along: each has its own path.
-    begin = start if lane_noise is None else (start, jnp.uint32(0))
-    if values.size <= _AT_ONCE or not is_outermost(machine, values, start, regime, lane_noise):
-        return _sweep(machine, parameter, values, begin, *options)[1]
-    # One program for all parts: the last part is filled up with NaN, which ends at once.
-    size, missing = values.size, -values.size % _AT_ONCE
-    rows = np.append(np.asarray(values), np.full(missing, np.nan)).reshape(-1, _AT_ONCE)
-    pieces = ((min(_AT_ONCE, size - _AT_ONCE * i), jnp.asarray(row)) for i, row in enumerate(rows))
+    return start
 
-    def step(start, row):
-        return _sweep(machine, parameter, row, start, *options)
+
+def _in_pieces(
+    step: Callable[[Any, jax.Array], Any], carry: Any, values: np.ndarray, progress: bool
+) -> Sweep:
+    """Run a sweep of many values in parts, which an interrupt leaves complete. One program serves
+    all parts: the last part is filled up with NaN, which ends at once."""
+    size, missing = values.size, -values.size % _AT_ONCE
+    rows = np.append(values, np.full(missing, np.nan)).reshape(-1, _AT_ONCE)
+    pieces = ((min(_AT_ONCE, size - _AT_ONCE * i), jnp.asarray(row)) for i, row in enumerate(rows))
 
     def joined(_, parts: list[Sweep]) -> Sweep:
         # In NumPy: for hundreds of arrays JAX would compile a program.
         return jtu.tree_map(lambda *x: jnp.asarray(np.concatenate(x)[:size]), *parts)
 
     return in_parts(
-        "sweep", step, begin, pieces, joined, progress=progress, unit="value", total=size
+        "sweep", step, carry, pieces, joined, progress=progress, unit="value", total=size
     )
 
 

@@ -1,0 +1,33 @@
+"""Tolerances of this folder, each relative to the motion: its sizes, its fastest event, its period.
+
+The figures "below" and "above" are the largest number that counted as zero, and the smallest one
+that did not, in 67 tests of branches, boundaries and grazings.
+"""
+
+# The corrector's last correction, in scaled unknowns; a flight with enough steps changes by less.
+# On steep curves rounding keeps corrections above it, up to the second number.
+CORRECTED, ROUGHLY = 1e-11, 1e-8
+
+# A parameter or a guard is at a value to rounding: a choice, below the corrector's tolerance.
+EXACT = 1e-12
+
+# Zero to rounding on a corrected motion: a speed or a clearance beyond its sign (below 6e-14, above
+# none), a rate, a size, 1 - |multiplier|.
+ROUNDING = 1e-9
+
+# Zero at a located point: the speed of an event that is lost (below 2e-14, above 7e-4), a touched
+# stop, the test of a bifurcation, the time between events that coincide. The corrector leaves up to
+# 5e-8 at the release from a soft stop that grazes.
+LOCATED = 1e-6
+
+# The distance of two solutions that are one motion, as where a curve closes (below 9e-13, above
+# 7e-5), or of a motion from its own repetition or image.
+SAME = 1e-7
+
+# Two motions are near each other: an orbit and its solution from event to event, both halves of a
+# period near a doubling. A choice: along a branch the difference from the own image takes all
+# values (5e-4 and 1e-3 were met).
+ALIKE = 1e-3
+
+# Most events of a cycle that are listed, with hops, switches and sections: a choice.
+LISTED = 32
