@@ -40,7 +40,7 @@ from .coordinates import Row
 from .declared import at_stop, hashable, limited_in, stops_of, switches_of
 from .event import AbstractSwitch, EventContext
 from .numbers import size_of
-from .settle import Contacts, Settled, settle
+from .settle import Contacts, Settled, released_share, settle
 from .state import with_components
 
 
@@ -398,11 +398,6 @@ def _argument_count(function: Callable[..., Any]) -> int:
     return min(max(count, 1), 3)
 
 
-# A body that a force sets in motion does not stick again at once: at this event its force equals
-# the largest one to the accuracy of the event, which this share exceeds. A choice.
-_RELEASED = 1e-6
-
-
 def settled_modes(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
     released: dict[int, Flag] | None = None,
@@ -449,7 +444,7 @@ def _slips(
         slip = friction.slip_sign(machine, s, state, flow)
         if begins is not None:  # the slip of a sticking body is rounding
             slip = jnp.where(jnp.abs(modes[i]) < 1, 0.0, slip)
-            ratio = jnp.where(begins[n], 1 - _RELEASED, ratio)
+            ratio = jnp.where(begins[n], 1 - released_share(slip), ratio)
         slips.append(slip)
         holds.append(ratio + jnp.zeros_like(s))
     return tuple(slips), tuple(holds)
