@@ -95,11 +95,11 @@ def least_period(
     **Arguments:** `sections`, more than `longest`; `exact`, numbers that repeat exactly, the
     impacts of the cycle before each section and the machine's own modes there; `tolerance`,
     relative to `sizes` (`row_sizes`) + |state|, by default the larger of 1e-6 and ten times
-    `wander`, the error of sections under their method; `angles`, True for angles.
+    `wander`, the error of sections under their method, or rounding; `angles`, True for angles.
     """
     states = in_rows(sections).T
-    if tolerance is None:
-        tolerance = jnp.maximum(_TOLERANCE, _WANDERS * jnp.asarray(wander, states.dtype))
+    noise = _noise(wander, states.dtype)
+    tolerance = jnp.maximum(_TOLERANCE, _WANDERS * noise) if tolerance is None else tolerance
     rows, size = jnp.concatenate([states, exact.astype(states.dtype)]), len(states)
     count = states.shape[1] - longest
     last = rows[:, longest:]
@@ -116,10 +116,14 @@ def least_period(
     periods = jnp.arange(1, longest + 1, dtype=jnp.int32)
     _, difference = jax.lax.scan(compared, None, periods)
     least = jnp.min(difference)
-    noise = jnp.maximum(wander, _ROUNDINGS * float(jnp.finfo(states.dtype).eps))
     most = jnp.minimum(_SLACK * tolerance, _WORSE * jnp.maximum(least, noise))
     period = jnp.min(jnp.where(difference <= most, periods, longest))
     return jnp.where(least <= tolerance, period, REGIMES.unsettled)
+
+
+def _noise(wander: Number, dtype: Any) -> Array:
+    """Return the error of sections by their method (`wander`) and by rounding."""
+    return jnp.maximum(jnp.asarray(wander, dtype), _ROUNDINGS * float(jnp.finfo(dtype).eps))
 
 
 Numbers = dict[str, Array]
@@ -478,7 +482,8 @@ class Regime(AbstractMeasure):
         is_weak = again & bool(self.averaged) & (chaos == REGIMES.chaotic) & (growth < _GROWS)
         chaos = jnp.where(is_weak, REGIMES.unsettled, chaos)
         # A motion without losses that repeats after many cycles has digits and no growth, too.
-        moves_on = seen.nearest > jnp.maximum(_TOLERANCE, _WANDERS * self.wander)
+        noise = _noise(self.wander, seen.nearest.dtype)
+        moves_on = seen.nearest > jnp.maximum(_TOLERANCE, _WANDERS * noise)
         is_neutral = (seen.digits > _DIGITS) & (jnp.abs(growth) < _NEUTRAL)
         is_torus = seen.successful & is_neutral & moves_on
         torus = jnp.where(is_torus, REGIMES.quasiperiodic, before)
