@@ -327,12 +327,23 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
 
 
 def _decide_with_ratios(x: Contacts, of: tuple[int, ...]) -> _Decided:
+    """Frictions begin to slip one by one, the fastest first: the less force of one may hold the
+    others. One that would then be accelerated against its slip is asked anew."""
+    n, rows = x.closed.shape[0], np.arange(x.slip.shape[0])
+    own = jnp.sum(x.gains * np.eye(x.rates.shape[0]), 1)[n:]
+
     def ask(state: tuple) -> tuple:
         slip, _, _, count = state
         new = _decide(x._replace(slip=slip), of)
-        begins = (new.mode != slip) & (x.hold != 1) & (new.code == SOLVED)
-        again = jnp.any(begins) & (count < slip.shape[0])
-        return jnp.where(begins, new.mode, slip), new, jnp.where(again, 1.0, 0.0), count + 1.0
+        pushed = x.gains @ new.force
+        size, rate = jnp.max(jnp.abs(x.rates)) + jnp.max(jnp.abs(pushed)), (pushed + x.rates)[n:]
+        returns = (slip != x.slip) & (rate * slip < -_share(_OPENS, rate) * size)
+        begins = (new.mode != slip) & (x.hold != 1) & (new.code == SOLVED) & ~jnp.any(returns)
+        pace = jnp.where(begins, rate * rate / jnp.where(own > 0, own, 1.0), -1.0)
+        first = begins & (rows == jnp.min(jnp.where(pace == jnp.max(pace), rows, len(rows))))
+        again = jnp.any(begins | returns) & (count < 3 * slip.shape[0])
+        slip = jnp.where(returns, x.slip, jnp.where(first, new.mode, slip))
+        return slip, new, jnp.where(again, 1.0, 0.0), count + 1.0
 
     shapes, zero = jax.eval_shape(lambda: _decide(x, of)), jnp.zeros((), x.rates.dtype)
     nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), shapes)

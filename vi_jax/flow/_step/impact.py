@@ -30,12 +30,14 @@ from ...machine import (
     impact_on,
     limited_in,
     longest_step,
+    on_held_surfaces,
     push_gains,
     row_of,
     stops_of,
     stops_on,
     strike,
     struck_modes,
+    switches_of,
 )
 from ..lane import Lane, add_entry, any_of, select, to_event, with_item
 from ..plan import Plan
@@ -441,6 +443,7 @@ def _hold_resting(
         still, lost = stop_bodies(plan, s, state, rests, contacts)
         if holds_anywhere(plan.machine):
             modes = struck_modes(plan.machine, s, still, modes, contact=contact)
+            still, modes = _stuck_by_then(plan, s, still, modes, contact, wait)
     resting, integrals = hold_contacts(plan.machine, modes, contact), lane.record.integrals
     flow = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
     end, still, passed = flow.extrapolate(pin(wait))
@@ -462,6 +465,29 @@ def _hold_resting(
         energy = energy + jnp.where(taken & any_rests, lost, 0.0)
         lane = lane.update_record(impact_energy=energy)
     return lane
+
+
+def _stuck_by_then(
+    plan: Plan, s: Scalar, state: State, modes: Scalars, contact: Scalars, wait: Scalar
+) -> tuple[State, Scalars]:
+    """Return state and modes of bodies at rest, without slips that vanish before the last impact: a
+    body that slides between impacts comes to rest with them."""
+    machine, wait = plan.machine, stop_gradient(wait)
+    flow = hold_contacts(machine, modes, contact).field(s, state)
+    stuck, any_sticks = list(modes), jnp.zeros((), bool)
+    for i, friction in enumerate(switches_of(machine)):
+        if friction.is_dry:
+            slip = stop_gradient(friction.speed_of_slip(machine, s, state))
+            rate = stop_gradient(friction.slip_rate(machine, s, state, flow))
+            ends = (jnp.abs(modes[i]) == 1) & (slip * rate < 0)
+            ends = ends & (jnp.abs(slip) <= jnp.abs(rate) * wait)
+            stuck[i], any_sticks = jnp.where(ends, 0.0, modes[i]), any_sticks | ends
+
+    def stopped(_: None) -> tuple[State, Scalars]:
+        still = on_held_surfaces(machine, s, state, tuple(stuck), contact)
+        return still, struck_modes(machine, s, still, tuple(stuck), contact=contact)
+
+    return jax.lax.cond(any_sticks, stopped, lambda _: (state, modes), None)
 
 
 def _without_rebounds(
