@@ -103,6 +103,14 @@ class Friction(AbstractSwitch):
         least = stop_gradient(self.roundings * float(jnp.finfo(slip.dtype).eps) * size)
         return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
 
+    def changes(self, machine: Machine, s: Scalar, before: State, after: State) -> Flag:
+        """Return whether a jump changes the slip, by more than rounding."""
+        slips = [stop_gradient(self.speed_of_slip(machine, s, x)) for x in (before, after)]
+        sizes = jtu.tree_map(jnp.abs, stop_gradient(before))
+        size = size_of(lambda x: self.speed_of_slip(machine, s, x), before, sizes)
+        least = self.roundings * float(jnp.finfo(size.dtype).eps) * (size + jnp.abs(slips[1]))
+        return jnp.abs(slips[1] - slips[0]) > least
+
     def begin(self, machine, s, state):
         """Return the direction of slip: `settled_modes` decides which bodies stick."""
         return jnp.sign(self.speed_of_slip(machine, s, state))

@@ -337,7 +337,7 @@ def _decide_with_ratios(x: Contacts, of: tuple[int, ...]) -> _Decided:
         new = _decide(x._replace(slip=slip), of)
         pushed = x.gains @ new.force
         size, rate = jnp.max(jnp.abs(x.rates)) + jnp.max(jnp.abs(pushed)), (pushed + x.rates)[n:]
-        returns = (slip != x.slip) & (rate * slip < -_share(_OPENS, rate) * size)
+        returns = (slip != x.slip) & (rate * slip < -2 * released_share(rate) * size)
         begins = (new.mode != slip) & (x.hold != 1) & (new.code == SOLVED) & ~jnp.any(returns)
         pace = jnp.where(begins, rate * rate / jnp.where(own > 0, own, 1.0), -1.0)
         first = begins & (rows == jnp.min(jnp.where(pace == jnp.max(pace), rows, len(rows))))

@@ -391,7 +391,7 @@ def bring_to_rest(
         near, distances = _near_contacts(step.plan, lane, met, impacts)
         rests, times = _resting_bodies(step.plan, lane, near, distances)
         impacts = near
-    return _hold_resting(step.plan, step.taken, lane, rests, impacts, times)
+    return _hold_resting(step.plan, step.taken, lane, at_event, rests, impacts, times)
 
 
 def _near_contacts(
@@ -420,11 +420,12 @@ def _near_contacts(
 
 
 def _hold_resting(
-    plan: Plan, taken: Flag, lane: Lane, rests: dict[int, Flag], impacts: dict[int, ImpactResult],
-    times: dict[int, Scalar],
+    plan: Plan, taken: Flag, lane: Lane, at_event: State, rests: dict[int, Flag],
+    impacts: dict[int, ImpactResult], times: dict[int, Scalar],
 ) -> Lane:  # fmt: skip
     """Return the lane after the infinitely many last impacts, with those bodies held that come to
-    rest. For each coordinate: `rests`, whether it does; `times`, the time until then (in s)."""
+    rest; `at_event` is the state before the impacts. For each coordinate: `rests`, whether it does;
+    `times`, the time until then (in s)."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     wait = jnp.zeros_like(s)
@@ -435,14 +436,14 @@ def _hold_resting(
     contacts, modes = {k: impact.contact for k, impact in impacts.items()}, lane.modes
     if has_contact_friction(plan.machine):
         # The direction of slip is known after the impact.
-        modes = struck_modes(plan.machine, s, state, modes, contact=contact)
+        modes = struck_modes(plan.machine, s, state, modes, contact=contact, before=at_event)
         slowed, rebound_energy = _without_rebounds(plan, s, state, modes, rests, contacts)
         still, lost = stop_bodies(plan, s, slowed, rests, contacts)
         lost = lost + rebound_energy
     else:
         still, lost = stop_bodies(plan, s, state, rests, contacts)
         if holds_anywhere(plan.machine):
-            modes = struck_modes(plan.machine, s, still, modes, contact=contact)
+            modes = struck_modes(plan.machine, s, still, modes, contact=contact, before=at_event)
             still, modes = _stuck_by_then(plan, s, still, modes, contact, wait)
     resting, integrals = hold_contacts(plan.machine, modes, contact), lane.record.integrals
     flow = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
@@ -485,7 +486,7 @@ def _stuck_by_then(
 
     def stopped(_: None) -> tuple[State, Scalars]:
         still = on_held_surfaces(machine, s, state, tuple(stuck), contact)
-        return still, struck_modes(machine, s, still, tuple(stuck), contact=contact)
+        return still, struck_modes(machine, s, still, tuple(stuck), contact=contact, before=still)
 
     return jax.lax.cond(any_sticks, stopped, lambda _: (state, modes), None)
 
