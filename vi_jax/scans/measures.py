@@ -374,12 +374,12 @@ class Regime(AbstractMeasure):
     A motion has the least period p ≤ `longest` after which its sections repeat within `tolerance`,
     with as many impacts in each cycle. The tolerance is relative to the size of each component,
     which is 1 for the paper's scenes; by default it is 1e-6, or ten tolerances of a method with
-    adaptive steps (8e-5 in single precision). See `least_period` for a motion that still spirals in. Other motions are
-    observed for another `observed` cycles. If the greatest Lyapunov exponent exceeds `threshold`
-    there (in the machine's unit of rates), the motion goes on for `lasting` cycles and is observed
-    once more. It is chaotic if its exponent exceeds `threshold` again. Otherwise it is transiently
-    chaotic: it has settled meanwhile, or is about to. `REGIMES` has the numbers for these kinds in
-    `period`.
+    adaptive steps (8e-5 in single precision). See `least_period` for a motion that still spirals
+    in. Other motions are observed for another `observed` cycles. If the greatest Lyapunov exponent
+    exceeds `threshold` there (in the machine's unit of rates), the motion goes on for `lasting`
+    cycles and is observed once more. It is chaotic if its exponent exceeds `threshold` again.
+    Otherwise it is transiently chaotic: it has settled meanwhile, or is about to. `REGIMES` has the
+    numbers for these kinds in `period`.
 
     The others are observed for another `averaged` cycles. They are quasi-periodic if averages over
     both halves agree to many digits (see `Rotation`), the exponent is zero to the accuracy of that
