@@ -183,14 +183,14 @@ class _Linked(vi.Mechanical):
     q = ("a", "b")
     linked: ClassVar[tuple[tuple[int, ...], ...]] = ()
     names: ClassVar[tuple[str, ...]] = q
-    masses: ClassVar[Any]
+    inertia: ClassVar[Any]
     begins: ClassVar[tuple[float, ...]]
 
     def start(self):
         return self.at(**{n: self.scales[i] * self.begins[i] for i, n in enumerate(self.q)})
 
     def mass(self, q):
-        return jnp.asarray(self.masses) / jnp.outer(self.scales, self.scales)
+        return jnp.asarray(self.inertia) / jnp.outer(self.scales, self.scales)
 
     def force(self, t, q, v):
         states = [getattr(x, n) / self.scales[i] for x in (q, v) for i, n in enumerate(self.q)]
@@ -206,7 +206,7 @@ class _Linked(vi.Mechanical):
 class Pair(_Linked):
     """Two bodies with a spring and a full mass matrix, each with a stop."""
 
-    masses, begins, value, bounds = ((1.0, 0.2), (0.2, 2.0)), (0.1, 0.0), 0.5, (0.3, 0.75)
+    inertia, begins, value, bounds = ((1.0, 0.2), (0.2, 2.0)), (0.1, 0.0), 0.5, (0.3, 0.75)
     cycle = 2 * np.pi / 0.7
 
     @property
@@ -224,7 +224,7 @@ class Pair(_Linked):
 class Colliding(_Linked):
     """Two bodies that strike each other, one with dry friction."""
 
-    masses, begins, value, bounds = ((1.0, 0.0), (0.0, 1.5)), (0.1, 0.5), 0.3, (0.1, 0.6)
+    inertia, begins, value, bounds = ((1.0, 0.0), (0.0, 1.5)), (0.1, 0.5), 0.3, (0.1, 0.6)
     cycle = 2 * np.pi / 0.9
 
     @property

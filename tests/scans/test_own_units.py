@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from own_units import MACHINES, Cranked, Cushioned, Heater, Struck, Valve, variants
+from own_units import MACHINES, Belted, Cranked, Cushioned, Heater, Struck, Valve, variants
 
 pytestmark = pytest.mark.slow
 
@@ -35,9 +35,12 @@ def test_sweeps(kind):
     assert_same_sweeps(kind)
 
 
-@pytest.mark.parametrize("kind", [x for x in MACHINES if x not in (Cranked, Cushioned, Heater)])
+@pytest.mark.parametrize(
+    "kind", [x for x in MACHINES if x not in (Belted, Cranked, Cushioned, Heater)]
+)
 def test_sweeps_in_single_precision(kind):
-    """The three others have long transients, or motions without a period."""
+    """The others have long transients or motions without a period. The body on a belt comes to
+    rest on its section, where in single precision a lane may end."""
     with jax.enable_x64(False):
         assert_same_sweeps(kind)
 
