@@ -215,6 +215,22 @@ def test_6_a_start_beyond_the_stop():
     assert "beyond a stop, say, or a number of the machine is not finite" in str(orbit)
 
 
+def test_a_guess_that_is_nan():
+    guess = vi.State(x=math.nan, u=1.0)
+    with warnings.catch_warnings(action="error"):
+        said = refused(lambda: vi.find_orbit(DrivenSection(), guess))
+    assert "`guess` must be finite, but its x is nan" in said
+
+
+def test_an_unknown_attribute_of_a_result():
+    run = vi.simulate(SCENE, SCENE.start(), 1)
+    with pytest.raises(
+        AttributeError, match="`Run` has no attribute `impact`; near names: impacts"
+    ):
+        run.impact  # noqa: B018  # pyright: ignore
+    assert vi.RESULTS[1] == vi.RESULTS[vi.RESULTS.bad_start]  # pyright: ignore
+
+
 def test_7_numpy_in_a_field():
     for kind in (ByNumpy, ByMath, FreeByNumpy, RubbedByNumpy, CycleByNumpy, StopByNumpy):
         said = refused(lambda kind=kind: simulate(kind()))
@@ -351,6 +367,25 @@ class OnNothing(Masses):
     contacts = vi.SoftStop(0.1, 9.0)
 
 
+class VelocityInPlaces(Masses):
+    def force(self, t, q, v):
+        return dict(x=-q.v.x)
+
+
+class AveragesOfForces(Masses):
+    def averages(self, t, q, v):
+        return dict(power=v.x**2)
+
+
+class WithoutSpeed(Masses):
+    def force(self, t, q):
+        return dict(x=-q.x)
+
+
+class CycleInWords(Harmonic):
+    cycle = "1.0"  # pyright: ignore
+
+
 class RowOfForces(Masses):
     def force(self, t, q, v):
         return dict(x=jnp.array([1.0]))
@@ -373,11 +408,29 @@ class Spare(Machine):
         ),
         (
             lambda: simulate(Spare()),
-            "of a Switch of a Spare must take the machine, `s`, the state: m",
+            "of a Switch of a Spare must take the machine, `s`, the state, but takes `m`, `s`, `x`",
         ),
         (lambda: NoType(stiffness=3.0), "in the class, `stiffness: float = 2.0`"),
+        (lambda: Machine(omegga=1.0), "`Machine` has no argument `omegga`; near names: omega"),
+        (lambda: Free(omega=1.0), "`Free` has no argument `omega`; it takes none"),
+        (lambda: vi.Regime(longst=4), "`Regime` has no argument `longst`; near names: longest"),
+        (lambda: vi.Reset(lambda m, t, z: z.x, modes=1.0), "`modes` of a Reset must be a function"),
+        (lambda: vi.simulate(Harmonic(), {"x": 0.0, "u": 1.0}, 1), "Pass `vi.State(x=0.0, ...)`"),
+        (lambda: Masses().at(vx=1.0), "the coordinates x. Give velocities by name in `v`: `at(x"),
+        (lambda: Masses().at(w=1.0), "The motion of 'w' is prescribed by the machine"),
+        (
+            lambda: vi.simulate(Masses(), Masses().at(x=jnp.ones(2)), 1),
+            "`start` must be one state (use `jax.vmap` for a batch), but its x has shape (2,)",
+        ),
+        (lambda: simulate(VelocityInPlaces()), "`q` has the positions and `v` the velocities"),
+        (lambda: simulate(AveragesOfForces()), "must take `s`, the state, but takes `t`, `q`, `v`"),
+        (lambda: simulate(WithoutSpeed()), "must take `t`, `q`, `v`, but takes `t`, `q`"),
         (lambda: simulate(Assigns()), "must return new numbers"),
         (lambda: simulate(CycleByZero()), "`cycle` of a CycleByZero must be finite, but divides"),
+        (
+            lambda: simulate(CycleInWords()),
+            "must be a number, or a property that gives one, but is '",
+        ),
         (lambda: simulate(WithUnits()), "but has 'spede'; near names: speed"),
         (lambda: vi.sweep(SCENE, "start.Y", [1.0]), "its names: damping_ratio, drive.freq"),
         (

@@ -76,6 +76,44 @@ class Bodies(vi.Mechanical):
 print(vi.simulate(Bodies(), Bodies().at(), 20).last)
 """
 
+BLOCK = """
+class Block(vi.Mechanical):
+    q = ("x", "y", "angle")
+    width: float = 0.2
+    height: float = 0.6
+    cycle = 0.5
+
+    def mass(self, q):
+        return 1.0, 1.0, (self.width**2 + self.height**2) / 12
+
+    @property
+    def contacts(self):
+        def corner(side):
+            a, b = side * self.width / 2, self.height / 2
+            gap = lambda q: q.y + a * jnp.sin(q.angle) - b * jnp.cos(q.angle)
+            along = lambda q: q.x + a * jnp.cos(q.angle) + b * jnp.sin(q.angle)
+            return vi.RigidStop(0.0, 0.3, "left", on=gap, friction=0.5, along=along)
+
+        return corner(-1.0), corner(1.0)
+
+    def force(self, t, q, v):
+        return dict(x=2 * jnp.cos(4 * jnp.pi * t), y=-9.81, angle=0.0)
+
+print(vi.simulate(Block(), Block().at(y=0.35), 20).last)
+"""
+
+DELAYED = """
+class Cutter(vi.AbstractMachine):
+    cycle: float = 2 * jnp.pi
+    contacts = vi.RigidStop(0.5, 0.7, on=("x", "u"))
+    delays = {"turn": 1.0}
+
+    def field(self, t, z, past):
+        return dict(x=z.u, u=jnp.cos(t) - z.x - 0.1 * z.u - 0.3 * (z.x - past.turn.x))
+
+print(vi.simulate(Cutter(), vi.State(x=0.0, u=0.0), 20).last)
+"""
+
 
 def readme() -> str:
     """Return the example of the README, without its picture."""
@@ -94,6 +132,8 @@ print(vi.continue_orbit(
     "paper's motor: `suggest_method`": f"{BEGIN}{MOTOR}\nvi.suggest_method(motor)",
     "oscillator with a stop: `simulate`": f"{BEGIN}{OSCILLATOR}",
     "two bodies with friction: `simulate`": f"{BEGIN}{BODIES}",
+    "block on two corners with friction: `simulate`": f"{BEGIN}{BLOCK}",
+    "delayed oscillator with a stop: `simulate`": f"{BEGIN}{DELAYED}",
     "README's example: `simulate`, `find_orbit`, gradient": readme(),
 }
 

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from scipy.interpolate import CubicSpline
 from tools.ideal import births
 from tools.pictures import legend_below
-from vi_jax.machine import Parameters, Scene
+from vi_jax.machines import Parameters, Scene
 from vi_jax.orbit import Boundary, Branch, boundary, closed_form_orbits, continue_orbit, find_orbit
 from vi_jax.plot import DASHES, color_of, paler
 

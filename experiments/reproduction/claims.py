@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from tools.ideal import vibration
 from vi_jax.flow import Run, simulate
-from vi_jax.machine import Parameters, Scene, SliderCrank
+from vi_jax.machines import Parameters, Scene, SliderCrank
 
 from .discrepancy import in_words, shares
 from .motions import (

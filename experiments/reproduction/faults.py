@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 from vi_jax.flow import simulate
-from vi_jax.machine import Parameters
+from vi_jax.machines import Parameters
 from vi_jax.orbit import closed_form_orbits
 
 from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, figure_scene

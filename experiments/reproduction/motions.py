@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import optax
 from vi_jax.flow import ExactFlight, Run, simulate
-from vi_jax.machine import Parameters, Scene
+from vi_jax.machines import Parameters, Scene
 from vi_jax.orbit import ClosedFormOrbits, Gradient, Orbit, closed_form_orbits, find_orbit
 
 # ζ, k and d of both figures.

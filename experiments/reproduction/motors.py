@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from vi_jax.flow import Run, simulate
-from vi_jax.machine import Parameters, Scene
+from vi_jax.machines import Parameters, Scene
 from vi_jax.orbit import Orbit, closed_form_orbits, find_orbit
 from vi_jax.plot import STOP, angle_axis, color_of
 

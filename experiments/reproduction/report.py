@@ -10,7 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from tools.pictures import save_picture
-from vi_jax.machine import Parameters
+from vi_jax.machines import Parameters
 from vi_jax.orbit import Boundary
 from vi_jax.plot import plot_sketch
 

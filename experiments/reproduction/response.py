@@ -8,7 +8,8 @@ import jax.tree_util as jtu
 import numpy as np
 from tools.ideal import closed_forms, vibration
 from vi_jax.flow import jit
-from vi_jax.machine import Scene, with_leaf
+from vi_jax.machine import with_leaf
+from vi_jax.machines import Scene
 from vi_jax.orbit import Branch, ClosedFormOrbits, continue_orbit, find_orbit
 from vi_jax.scans import REGIMES, Sweep, lyapunov, sweep
 

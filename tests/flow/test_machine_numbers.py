@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.machine.numbers import by_name, with_leaf
+from vi_jax.machine import by_name, with_leaf
 
 NUMBERS = [
     *map(float, np.linspace(1.05, 1.15, 7)),

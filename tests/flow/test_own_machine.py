@@ -56,7 +56,7 @@ class Clockless(BouncingBall):
     ("kind", "told"),
     [
         (Swapped, "`field` of a Swapped must take `s` first and then the state"),
-        (Clockless, "`field` of a Clockless must take `s`, the state: too many"),
+        (Clockless, "`field` of a Clockless must take `s`, the state, but takes `"),
     ],
 )
 def test_field_with_other_arguments_raises(kind, told):

@@ -11,6 +11,7 @@ import vi_jax as vi
 from vi_jax.flow.machine_checks import check_parts
 from vi_jax.flow.results import code_of_outcome, outcome_of
 from vi_jax.machine import events_of, stop_in_words
+from vi_jax.orbit import multipliers_in_words
 
 
 class Balls(vi.Mechanical):
@@ -177,12 +178,25 @@ def test_prints():
     text = str(vi.simulate(Circuit(), vi.State(volt=50.0, i=1e-30), 1))
     assert "volt in [18.394, 50] V" in text and "i = 0\n" in text
     assert "rtol=1e-09" in str(vi.Adaptive(rtol=1e-9))
+    assert multipliers_in_words([0.5, 1e-3 - 2e-3j, -1e-3 + 1e-17j, 1e-17], 3, 1e-12) == [
+        "0.5", "0.001-0.002i", "-0.001", "0"
+    ]  # fmt: skip
     machine = Pair()
     stops = [x for x in events_of(machine) if isinstance(x, vi.RigidStop | vi.SoftStop)]
     assert [stop_in_words(machine, x) for x in stops] == [
         "right stop of a", "right stop of b", "buffer", "left stop", "right soft stop 0",
         "right soft stop 1",
     ]  # fmt: skip
+
+
+def test_logs_name_their_stops():
+    class Few(Pair):
+        contacts = Pair.contacts[:3:2]
+
+    run = vi.simulate(Few(), vi.State(a=0.0, b=0.5, u=1.0, v=1.0), 1, impact_log=4, event_log=4)
+    first, second = str(run.event_log), str(run.impact_log)
+    assert "impact (right stop) at " in first and "impact (buffer) at " in first
+    assert "right stop at " in second and "buffer at " in second
 
 
 class Rocking(vi.AbstractMachine):

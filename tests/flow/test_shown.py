@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.machine.numbers import by_name, unit_of
+from vi_jax.machine import by_name, unit_of
 
 M = vi.machines
 MACHINES = [

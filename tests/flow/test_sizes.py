@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.flow.sizes import sizes_of
+from vi_jax.flow.sizes import row_sizes, sizes_of
+
+from planar import Block
 
 
 class Thermostat(vi.AbstractMachine):
@@ -154,3 +156,16 @@ def test_rounding_of_a_number_at_rest_is_not_its_size():
         start = jax.tree.map(jnp.asarray, machine.at(x=0.5, tilt=tilt))
         sizes = sizes_of(machine, zero, start, ())
         assert sizes is not None and float(sizes.tilt) == size
+
+
+@pytest.mark.parametrize("creep", [0.0, 1e-12])
+def test_friction_gives_a_standing_body_a_size_along_the_floor(creep):
+    """Regression: a standing block was unsettled, since its size was that of its rounding."""
+    block = Block(mu=0.3)
+    start = block.at(x=creep, y=0.5, v=dict(x=creep))
+    unit = block.cycle / (2 * np.pi)
+    x, v_x = row_sizes(block, start)[np.array([0, 3])]
+    # The friction of a corner acts on the mass of that corner, which turns as well.
+    lightest = 1 / (1 + 0.5**2 * 3 / (0.2**2 + 0.5**2))
+    assert 0.3 * 9.81 * unit * lightest <= v_x * 1.000001 <= 0.3 * 9.81 * unit
+    assert float(x) == pytest.approx(unit * float(v_x), rel=0.35)

@@ -13,7 +13,7 @@ from vi_jax.lanes._array_rules import STRUCTURAL
 from vi_jax.lanes._operations import ELEMENTWISE
 
 # Primitives of this package, and those of JAX that are not public or not in all its versions.
-OWN = {"sincos", "pin", "quotient", "weighted", "weighted_quotient", "weighted_dot"}
+OWN = {"sincos", "pin", "quotient", "weighted", "weighted_quotient", "weighted_sum", "weighted_dot"}
 ELSEWHERE = {"copy_p", "pvary", "reshard", "expand_dims", "empty2", "stack", "unstack"}
 
 

@@ -204,3 +204,23 @@ def test_tall_blocks_rock_to_rest():
     # rest are summed up, with an error of second order in the time that they take.
     assert bool((slid > -1e-8).all())
     np.testing.assert_allclose(slid[:4], 0.0, atol=1e-8)
+
+
+class Shaken(Block):
+    """A block on a floor that is shaken; its corners rest from the start."""
+
+    cycle = 0.5
+
+    def force(self, t, q, v):
+        return dict(x=-6.0 * jnp.sin(4 * jnp.pi * t), y=-9.81, tilt=0.0)
+
+
+@pytest.mark.slow
+def test_a_corner_that_another_impact_lifts_is_released():
+    block = Shaken(mu=0.45)
+    log = vi.simulate(block, block.at(y=0.5), 4, event_log=16).event_log
+    kinds, numbers = np.asarray(log.kind).ravel(), np.asarray(log.number).ravel()
+    held = np.isin(kinds, [vi.EVENTS.index(x) for x in ("rest", "release")])
+    for corner in (0, 1):
+        of_corner = kinds[held & (numbers == corner)]
+        assert len(of_corner) >= 7 and (np.diff(of_corner) != 0).all()  # rests and releases in turn

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 import vi_jax as vi
-from vi_jax.machine.numbers import leaf_names, unit_of
+from vi_jax.machine import leaf_names, unit_of
 
 M = vi.machines
 

@@ -6,8 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.machine import stops_of
-from vi_jax.machine.numbers import with_leaves
+from vi_jax.machine import stops_of, with_leaves
 
 from differences import quick
 

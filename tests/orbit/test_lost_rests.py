@@ -106,4 +106,4 @@ def test_an_event_reaches_the_end_of_a_chatter():
     assert branch.ends == ("grazing", "bounds") and (branch.rests == 1).all()
     (point,) = branch.special
     assert point.parameter == pytest.approx(0.5 * np.pi - 0.6 * 1.1788045220098, abs=1e-7)
-    assert "coincide" in point.detail
+    assert "(the end of the chatter on the right stop and switch 0, at clock 1.439" in point.detail

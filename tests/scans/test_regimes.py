@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.orbit import MotionSections
+from vi_jax.orbit import MotionSections, agreement, rotation_number
 from vi_jax.scans.measures import least_period
 
 from kicked import Ring, at, rotation_of
@@ -170,6 +170,19 @@ def test_quasi_periodic_motions_of_rings():
     turns = data.rotation.values[:, 1]
     np.testing.assert_allclose(turns, rotation_of(a, 0.1), atol=1e-9)
     assert (data.digits.values[:, 1] > 5).all()
+    assert np.isnan(data.rotation.values[:, 0]).all() and (data.digits.values[:, 0] == 16).all()
+
+
+def test_a_rotation_number_without_meaning_is_nan():
+    """A component that is rounding does not count; a chaotic motion has no rotation number."""
+    golden, random = (np.sqrt(5) - 1) / 2, np.random.default_rng(0)
+    angles = 2 * np.pi * golden * np.arange(1024)
+    rows = jnp.stack([np.cos(angles), np.sin(angles), 1e-17 * random.standard_normal(1024)], axis=1)
+    assert agreement(rows) > 5 and abs(rotation_number(rows) - (1 - golden)) < 1e-9
+    assert agreement(rows[:, 2:]) == 16 and np.isnan(rotation_number(rows[:, 2:]))
+    assert np.isnan(rotation_number(1 + 1e-8 * rows, wander=1e-8))
+    data = vi.scan(Ring(0.2, 1.4), {"a": [0.21]}, measure="rotation", start=at(0.3, 0.1))
+    assert data.digits.values[0] < 3.5 and np.isnan(data.rotation.values[0])
 
 
 @pytest.mark.slow
@@ -230,7 +243,8 @@ def test_a_motion_that_slowly_locks_is_not_quasi_periodic():
         Ring(middle, 0.1), {"locking": [1e-3, 0.0]}, measure=("regime", "rotation"), **options
     )
     assert (data.period.values == [int(vi.REGIMES.unsettled), 3]).all()
-    assert data.rotation.values[0] == pytest.approx(1 / 3, abs=1e-3)
+    assert data.digits.values[0] < 3.5 and np.isnan(data.rotation.values[0])  # not yet locked
+    assert data.rotation.values[1] == pytest.approx(1 / 3, abs=1e-12)
     slow = vi.lyapunov(
         Ring(middle, 0.1, locking=1e-3), at(0.3, 0.1), 2048, settle=500, number=1, progress=False
     )

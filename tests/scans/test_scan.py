@@ -53,6 +53,7 @@ def test_labels_units_and_attributes(data):
     assert "ExactFlight" in data.attrs["method"] and data.attrs["settle"] == 100
     assert set(data.Y.dims) == {"drive.frequency_ratio", "start.Y", "cycle"}
     assert data.result.attrs["flag_meanings"].split()[1] == "successful"
+    assert data.attrs["period_codes"].startswith("-1 chaotic, -2 unsettled")
 
 
 def test_blocks_do_not_change_results(data):

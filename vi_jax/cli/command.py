@@ -43,9 +43,9 @@ from ..machine import (
     leaf_names,
     with_leaves,
 )
-from ..machines.named import InputError, check_keys, machine_of, value_of
 from ..orbit import continue_orbit, find_orbit
 from ..scans import REGIMES, Sweep, basins, scan, sweep
+from .named import InputError, check_keys, machine_of, value_of
 
 _ENDINGS = {"output": (".csv", ".nc"), "picture": (".png", ".pdf", ".svg")}
 _LEFT_OUT = {"machine", "orbit", "options", "progress", "cluster", "throw", "key"}

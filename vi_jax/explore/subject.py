@@ -22,8 +22,6 @@ from .._types import State
 from ..flow import RESULTS, Run, chosen, simulate
 from ..machine import (
     AbstractMachine,
-    Parameters,
-    Scene,
     check_again,
     components,
     convert_start,
@@ -35,7 +33,8 @@ from ..machine import (
     with_leaves,
     with_unit,
 )
-from ..orbit import STABILITY, complex_in_words, cycle_map, multipliers_of, stability_of
+from ..machines import Parameters, Scene
+from ..orbit import STABILITY, cycle_map, multipliers_in_words, multipliers_of, stability_of
 from ..plot import MotionPath, axis_name, motion_path
 from ..scans import REGIMES, Regime, lyapunov, moved_by_stops
 
@@ -135,7 +134,7 @@ class Motion(NamedTuple):
         verdict = STABILITY[stability_of(jnp.asarray(self.multipliers))]
         if abs(abs(self.multipliers[0]) - 1) < _NEUTRAL:
             verdict = STABILITY[STABILITY.neutral]
-        values = ", ".join(complex_in_words(m, 4, _NEUTRAL) for m in self.multipliers)
+        values = ", ".join(multipliers_in_words(self.multipliers, 4, _NEUTRAL))
         return f"multipliers {values}: {verdict}"
 
 
@@ -349,12 +348,11 @@ def ready() -> dict[str, Callable[[], Subject]]:
         "Scene, ideal drive": lambda: Subject(ideal, _IDEAL),
         "Scene, motor": lambda: Subject(motor, _MOTOR),
     }
-    for name, kind in sorted(vars(machines).items()):
-        if inspect.isclass(kind) and issubclass(kind, AbstractMachine):
-            parameters = inspect.signature(kind).parameters.values()
-            if all(part.default is not part.empty for part in parameters):
-                make: Any = kind
-                found[name] = lambda make=make: Subject(make())
+    for name in sorted(machines.READY):
+        make = getattr(machines, name)
+        parameters = inspect.signature(make).parameters.values()
+        if all(part.default is not part.empty for part in parameters):
+            found[name] = lambda make=make: Subject(make())
     return found
 
 

@@ -10,7 +10,8 @@ from .machine_checks import check_parts, check_values, depends_on_time
 from ._quantities import average_names, has_averages, has_quantities, quantities_on, quantity_names
 from ._simulate import compiling, jit, simulate, simulate_pool, simulate_states
 from .arguments import (
-    RunOptions, as_floats, check_leaves, check_reals, check_start, machine_of, make_plan, shape_of,
+    RunOptions, as_floats, check_finite, check_leaves, check_reals, check_start, machine_of,
+    make_plan, shape_of,
 )
 from .history import history_of_function, with_first_history
 from ._step.roots import Rates, force_rate, guard_rates

@@ -15,7 +15,7 @@ from jax.extend.core import Jaxpr
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from .._checks import concrete, fields_with
+from .._checks import concrete, fields_with, outside_of_traces
 from .._types import Scalar, State
 from ..lanes import called, propagate_marks
 from ..machine import (
@@ -23,6 +23,7 @@ from ..machine import (
     QUANTITIES,
     AbstractMachine,
     begin_modes,
+    check_takes,
     components,
     is_builtin,
     leaf_names,
@@ -131,6 +132,7 @@ def _checked_names(
     """Return the names of a machine's averages or quantities (`attribute`), sorted; names of
     components of `start` are in use already. **Raises:** as `average_names`."""
     label = f"`{attribute}` of a {type(machine).__name__}"
+    check_takes(function, label, "`s`, the state", arguments, len(arguments) - 2)
     with explain_errors(label):
         found = jax.eval_shape(lambda *x: _as_arrays(label, function(*x)), *arguments)
     taken = _RESERVED | set(leaf_names(machine)) | set(components(start))
@@ -201,7 +203,7 @@ def _jumping(averages: _Averages) -> str | None:
     def values(s: Scalar, state: State) -> dict[str, Array]:
         return {name: jnp.asarray(x) for name, x in machine.averages(s, state, *modes).items()}
 
-    with jax.ensure_compile_time_eval():
+    with outside_of_traces():
         row, unravel = ravel_pytree(jtu.tree_map(jnp.asarray, (0.0, state)))
         jaxpr = jax.make_jaxpr(lambda x: values(*unravel(x)))(row).jaxpr
         if not _decides(jaxpr, [True]):

@@ -27,6 +27,8 @@ from ..machine import (
     others_of,
     outcomes_of,
     stated,
+    stop_in_words,
+    stops_of,
     switches_of,
     without_modes,
 )
@@ -300,7 +302,12 @@ def _quantities(plan: Plan, points: State) -> dict[str, Array]:
 
 def _impact_log(plan: Plan, entries: Any) -> ImpactLog:
     phase, speed, stop, *impulses = _by_cycle(plan, entries, used=2)
-    return ImpactLog(as_logged(plan.machine, phase), speed, _as_integers(stop), *impulses)
+    clock, stops = as_logged(plan.machine, phase), _stop_names(plan.machine)
+    return ImpactLog(clock, speed, _as_integers(stop), *impulses, stop_names=stops)
+
+
+def _stop_names(machine: AbstractMachine) -> tuple[str, ...]:
+    return tuple(stop_in_words(machine, stop) for stop in stops_of(machine))
 
 
 def _event_log(plan: Plan, entries: Any) -> EventLog:
@@ -310,8 +317,9 @@ def _event_log(plan: Plan, entries: Any) -> EventLog:
     for i, switch in enumerate(switches):
         index = sum(other.word == switch.word for other in switches[:i])
         modes.append(switch.name or f"{switch.word} {index}")
-    clock = as_logged(plan.machine, phase)
-    return EventLog(clock, _as_integers(code), _as_integers(number), value, names, tuple(modes))
+    clock, stops = as_logged(plan.machine, phase), _stop_names(plan.machine)
+    places = clock, _as_integers(code), _as_integers(number), value
+    return EventLog(*places, names, tuple(modes), stops)
 
 
 def _by_cycle(plan: Plan, entries: Array, *, used: int) -> list[Array]:

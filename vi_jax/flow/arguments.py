@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -35,7 +36,6 @@ from .._types import Machine, State
 from ..machine import (
     AbstractMachine,
     Mechanical,
-    Scene,
     Turn,
     begin_modes,
     check_takes,
@@ -59,6 +59,7 @@ from ..machine import (
     without_modes,
 )
 from ..machine import State as NamedState
+from ..machines import Scene
 from ._quantities import average_names, check_units, quantity_names
 from .history import check_delays, with_memory
 from .machine_checks import (
@@ -157,6 +158,7 @@ def make_plan(
     require_session("start", start)
     if has_delays(machine):
         check_delays(machine, method)
+        check_finite("start", start)
         machine, memory = with_memory(machine, as_floats(machine, start), history)
     method.check(machine)
     if samples and is_autonomous(machine, start):
@@ -182,7 +184,7 @@ def make_plan(
             "vi_jax is running in single precision: errors near 1e-6 and tolerances to match. For "
             'double precision call `jax.config.update("jax_enable_x64", True)` first.'
         )
-    dtype = machine.position(start).dtype
+    dtype = jax.eval_shape(machine.position, start).dtype
     options.check_limits(dtype)
     max_steps, rests = options.max_steps, options.rests
     plan = Plan(
@@ -312,9 +314,10 @@ def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
     except (AttributeError, TypeError, ValueError, LookupError) as error:
         if str(error).partition(" must ")[0].endswith(f"of a {type(machine).__name__}"):
             raise
+        hint = ". Pass `vi.State(x=0.0, ...)`." if isinstance(state, Mapping) else ""
         raise TypeError(
             f"Argument `{argument}` must be a state of this machine, but got {state!r}, whose "
-            f"rate cannot be computed: {error}"
+            f"rate cannot be computed: {error}{hint}"
         ) from None
 
 
@@ -339,6 +342,14 @@ def check_reals(name: str, state: State) -> None:
         require_real(name, part, x)
 
 
+def check_finite(argument: str, state: State) -> None:
+    """**Raises:** `ValueError` that names a part of a state that is not finite."""
+    for part, x in named_leaves(state):
+        numbers = concrete(x)
+        if numbers is not None and not np.isfinite(numbers).all():
+            raise ValueError(f"Argument `{argument}` must be finite, but its {part} is {numbers}.")
+
+
 def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int, ...]:
     """Return the shape of position and velocity in a state, `()` in a single one. **Raises:**
     `TypeError` for an invalid state of this machine."""
@@ -351,12 +362,19 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
             words = (
                 f"{name} of shape {shape}" if shape else name for name, shape in wanted.items()
             )
+            other = next((x for x in given if given[x] != wanted.get(x, given[x])), None)
+            if other is not None:
+                raise TypeError(
+                    f"Argument `{argument}` must be one state (use `jax.vmap` for a batch), but "
+                    f"its {other} has shape {given[other]}, not {wanted[other]}."
+                )
             raise TypeError(
                 f"Argument `{argument}` must be a state with {', '.join(words)}, as "
                 f"`machine.at(...)` returns, but got {state!r}."
             )
     try:
-        shape = jnp.shape(machine.position(state)) or jnp.shape(machine.velocity(state))
+        place, velocity = _evaluated(machine, lambda x, z: (x.position(z), x.velocity(z)), state)
+        shape = jnp.shape(place) or jnp.shape(velocity)
     except (AttributeError, TypeError, LookupError) as error:
         raise TypeError(
             f"Argument `{argument}` must be a state of this machine, but got {state!r}: "
@@ -367,6 +385,15 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
     if not shape and not has_velocity(machine, state):
         _check_flow(argument, machine, state)
     return shape
+
+
+def _evaluated(
+    machine: AbstractMachine, function: Callable[[Any, State], Any], state: State
+) -> Any:
+    """Return `function(machine, state)`: of a machine with gaps that are functions by one program,
+    not by one for each operation."""
+    has_functions = any(callable(getattr(x, "on", None)) for x in contacts_in(machine))
+    return (eqx.filter_jit(function) if has_functions else function)(machine, state)
 
 
 def _check_turn(machine: AbstractMachine, start: State) -> None:
@@ -422,18 +449,16 @@ def check_start(machine: AbstractMachine, start: State, repeats: bool = True) ->
             'of arrays, `on=("x[0]", "v[0]")`, or `position` and `velocity` of the machine pick '
             "them."
         )
-    for part, x in named_leaves(start):
-        numbers = concrete(x)
-        if numbers is not None and not np.isfinite(numbers).all():
-            raise ValueError(f"Argument `start` must be finite, but its {part} is {numbers}.")
+    check_finite("start", start)
     if isinstance(machine, Scene):
         machine.check_start(start)
     if isinstance(start, eqx.Module):
         require_ranges(start)
     _check_turn(machine, start)
+    positions = lambda machine, x: [each.position(x) for each in machine.coordinates]
+    places = _evaluated(machine, positions, start)
     for i, stop in enumerate(stops_of(machine)):
-        gap = concrete(stop.gap)
-        Y = concrete(machine.coordinates[stop.coordinate].position(start))
+        gap, Y = concrete(stop.gap), concrete(places[stop.coordinate])
         if Y is None or gap is None:
             continue
         depth = np.max(stop.sign * Y - gap)
@@ -441,6 +466,7 @@ def check_start(machine: AbstractMachine, start: State, repeats: bool = True) ->
         if slack is not None and depth > np.max(slack):
             raise ValueError(
                 f"Argument `start` must not lie beyond a stop, but lies {depth:g} beyond stop {i} "
-                f"({stop.side}, gap {gap}). A stop is at +gap on the right, at -gap on the left."
+                f"({stop.name or stop.side}, gap {gap}). A stop is at +gap on the right, at -gap "
+                "on the left."
             )
     check_values(machine, start, repeats)

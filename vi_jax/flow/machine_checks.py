@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from .._checks import concrete, named_leaves
+from .._checks import concrete, named_leaves, outside_of_traces
 from .._messages import warn
 from .._types import Scalar, Scalars, State
 from ..lanes import dependent_results
@@ -23,11 +23,9 @@ from ..machine import (
     AbstractMachine,
     Coordinate,
     DryFriction,
-    LinearMachine,
     Mechanical,
     Reset,
     RigidStop,
-    Scene,
     SoftStop,
     begin_modes,
     check_takes,
@@ -38,6 +36,7 @@ from ..machine import (
     event_of,
     events_of,
     field_in,
+    frictions_in,
     guard_of,
     has_own_modes,
     is_angle,
@@ -53,6 +52,7 @@ from ..machine import (
     switches_of,
 )
 from ..machine import State as NamedState
+from ..machines import LinearMachine, Scene
 
 _TRACER_ERRORS = (
     jax.errors.ConcretizationTypeError,
@@ -93,7 +93,8 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
             ) from None
         if isinstance(error, TypeError):  # it says what must be
             raise
-        raise TypeError(f"{label} cannot be computed: {error}") from error
+        names = " In `force`, `q` has the positions and `v` the velocities." * ("mass" in member)
+        raise TypeError(f"{label} cannot be computed: {error}{names}") from error
     if flow is None:
         raise TypeError(
             f"{label} must return the components of its state, but its `return` is missing."
@@ -219,7 +220,7 @@ def check_values(machine: AbstractMachine, start: State, repeats: bool = True) -
         ticks = clock_of(machine, start) is None and not is_autonomous(machine, start)
         zero, state = jtu.tree_map(np.asarray, (np.zeros(()), start))
         found = 0.0, [], ()
-        with jax.ensure_compile_time_eval():
+        with outside_of_traces():
             timed = ticks or _has_timed_field(machine, state)
             masses = _masses(machine, state)
             if timed or others_of(machine):
@@ -305,7 +306,7 @@ def _check_slips(machine: AbstractMachine, start: State) -> None:
         if not isinstance(friction, DryFriction) or not friction.slip_takes_time:
             continue
         try:
-            with jax.ensure_compile_time_eval():
+            with outside_of_traces():
                 time, extent, coarse, fine = map(np.asarray, _steepest(machine, number, start))
         except Exception:  # the error is raised with a better message when the friction is traced
             return
@@ -371,7 +372,7 @@ def _check_surfaces(machine: AbstractMachine, state: State) -> None:
         if len(functions) < 2 or is_builtin(type(machine)):
             continue
         try:
-            with jax.ensure_compile_time_eval():
+            with outside_of_traces():
                 pair = _parallel([f for _, f in functions], machine, state)
         except Exception:  # the error is raised with a better message when the function is traced
             continue
@@ -429,7 +430,7 @@ def _check_friction_forces(machine: AbstractMachine, start: State) -> None:
         if not isinstance(friction, DryFriction) or not (callable(friction.level) or friction.load):
             continue
         try:
-            with jax.ensure_compile_time_eval():
+            with outside_of_traces():
                 force = float(_friction_force(machine, number, start))
         except Exception:  # the error is raised with a better message when the friction is traced
             return
@@ -477,7 +478,7 @@ def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -
     negative in any state around the start. `zero` is an argument: JAX compiles expressions of
     constants alone."""
     zero = zero.astype(jnp.result_type(machine.position(start)))
-    modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
+    modes, cycle = _modes_near(machine, zero, start), zero + machine.cycle
     later = np.arange(1, 5) + INNER_INSTANT
     instants = zero + cycle * np.array([0.0, INNER_INSTANT, 1.0, *later])
     prescribed = getattr(machine, "with_prescribed", lambda s, state: state)
@@ -497,6 +498,14 @@ def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -
     return cycle, jtu.tree_leaves(fields), below
 
 
+def _modes_near(machine: AbstractMachine, s: Scalar, start: State) -> Scalars:
+    """Return the modes at a start, without the question which bodies stick: all slide."""
+    modes = list(begin_modes(machine, s, start, settles=False))
+    for i in frictions_in(machine):
+        modes[i] = jnp.where(modes[i] == 0, 1.0, modes[i])
+    return tuple(modes)
+
+
 def _guards(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> list[Array]:
     first, last = len(stops_of(machine)) + len(switches_of(machine)), len(events_of(machine)) - 1
     found = (guard_of(machine, i, s, state, modes) for i in range(first, last))
@@ -505,7 +514,7 @@ def _guards(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -
 
 def depends_on_time(function: Callable[..., Any], machine: AbstractMachine, state: State) -> bool:
     """Return whether `function(machine, s, state, modes)` may depend on `s`."""
-    of_time = lambda s, x: function(machine, s, x, begin_modes(machine, s, x))
+    of_time = lambda s, x: function(machine, s, x, _modes_near(machine, s, x))
     traced = jax.make_jaxpr(of_time)(np.zeros(()), state).jaxpr
     sources = [True] + [False] * len(jtu.tree_leaves(state))
     return any(dependent_results(traced, sources, smooth=False))
@@ -582,8 +591,11 @@ def check_parts(machine: AbstractMachine) -> None:
     _check_names(machine)
     with explain_errors(f"`cycle` of a {name}"):
         length = machine.cycle
-    if callable(length):
-        raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
+    if callable(length) or isinstance(length, str | bool | None):
+        got = "a function" if callable(length) else repr(length)
+        raise TypeError(
+            f"`cycle` of a {name} must be a number, or a property that gives one, but is {got}."
+        )
     if jnp.shape(length):
         raise ValueError(
             f"`cycle` of a {name} must be one number, but has shape {jnp.shape(length)}."

@@ -18,6 +18,7 @@ from ..lanes import dependent_results
 from ..machine import (
     AbstractMachine,
     Prepared,
+    Shown,
     cycle_time,
     is_autonomous,
     leaf_names,
@@ -58,7 +59,7 @@ def normal_pair(key: Array, first: Array, second: Array, dtype) -> tuple[Array, 
     return stop_gradient(radius * jnp.cos(angle)), stop_gradient(radius * jnp.sin(angle))
 
 
-class WhiteNoise(eqx.Module):
+class WhiteNoise(Shown):
     """White noise on accelerations: dV = … dt + σ dW for the velocities that are named.
 
     It acts as impulses at `impulses` evenly spaced instants of each cycle, the last at its end. At

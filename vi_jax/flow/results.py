@@ -95,7 +95,7 @@ else:
             return isinstance(value, _Member) and value.kind is cls
 
         def __getitem__(cls, item):
-            return list(cls._texts.values())[int(item.number)]
+            return list(cls._texts.values())[int(getattr(item, "number", item))]
 
         def __getattr__(cls, name: str) -> Any:
             if name.startswith("_"):
@@ -106,7 +106,7 @@ else:
 
     class NamedEnumeration(metaclass=_Kind):
         """Names with a text each, as class attributes. Members are pytrees, which may be traced and
-        batched, and `RESULTS[item]` is the text of one."""
+        batched, and `RESULTS[item]` is the text of one, or of its number."""
 
         @classmethod
         def where(cls, condition, a, b):
@@ -309,7 +309,8 @@ class RESULTS(NamedEnumeration):
     unresolved = "An impact could not be located within the step."
     max_steps = (
         "The number of steps exceeded `max_steps` before the last cycle was complete, or 65,536 "
-        "within one, as where an autonomous machine comes to rest off its section."
+        "within one, as where an autonomous machine comes to rest off its section, or a relay "
+        "without hysteresis switches ever faster."
     )
     switch_unresolved = "The event of a switch could not be located within the step."
     section_unresolved = (
@@ -445,12 +446,15 @@ class ImpactLog(Summarized):
     """Impulse of the stop on the body, away from the stop (unit of mass times that of speed)."""
     drag: Float[Array, "cycles size"]
     """Impulse of friction along the stop; 0 without friction."""
+    stop_names: tuple[str, ...] = eqx.field(static=True, default=())
+    """The names of the rigid stops, by number."""
 
     def summary(self) -> str:
         """Return the impacts of the first cycles: clock, stop and speed."""
 
         def word(i: int, j: int) -> str:
-            return f"stop {self.stop[i, j]} at {self.phase[i, j]:.6g} by {self.speed[i, j]:.4g}"
+            stop = self.stop_names[int(self.stop[i, j])]
+            return f"{stop} at {self.phase[i, j]:.6g} by {self.speed[i, j]:.4g}"
 
         return _listing("impact", self.stop >= 0, word)
 
@@ -476,6 +480,8 @@ class EventLog(Summarized):
     """The names of the machine's resets, by number; "" for one without a name."""
     mode_names: tuple[str, ...] = eqx.field(static=True, default=())
     """The names of the parts with a mode, by number: a friction, a soft stop, a switch."""
+    stop_names: tuple[str, ...] = eqx.field(static=True, default=())
+    """The names of the rigid stops, by number."""
 
     def summary(self) -> str:
         """Return the events of the first cycles: kind; stop, switch or event; clock."""
@@ -483,10 +489,8 @@ class EventLog(Summarized):
         def word(i: int, j: int) -> str:
             kind, number = EVENTS[int(self.kind[i, j])], int(self.number[i, j])
             after = f" becomes {self.value[i, j]:g}" if kind == "mode" else ""
-            of = {"mode": "switch", "reset": "event"}.get(kind, "stop")
-            names = {"mode": self.mode_names, "reset": self.names}.get(kind)
-            name = names[number] if names else ""
-            return f"{kind} ({name or f'{of} {number}'}{after}) at {self.phase[i, j]:.6g}"
+            names = {"mode": self.mode_names, "reset": self.names}.get(kind, self.stop_names)
+            return f"{kind} ({names[number] or f'event {number}'}{after}) at {self.phase[i, j]:.6g}"
 
         return _listing("event", self.number >= 0, word)
 

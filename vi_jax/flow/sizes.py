@@ -30,6 +30,7 @@ from ..machine import (
     longest_step,
     mode_number,
     modes_of,
+    push_of,
     scales_known,
     size_of,
     stops_of,
@@ -127,6 +128,9 @@ def _known_sizes(
     sizes = jtu.tree_map(
         lambda x, v: jnp.maximum(x, unit * jnp.max(jnp.abs(v), axis=0)), values, rates
     )
+    for friction in holding:
+        if isinstance(friction, ContactFriction):
+            sizes = _with_slip(machine, friction, start, sizes)
     # Different factors prevent a force that acts on a difference from cancelling.
     leaves, tree = jtu.tree_flatten(sizes)
     rng = np.random.default_rng(0)
@@ -141,6 +145,21 @@ def _known_sizes(
         return jnp.where(rests, 0.0, jnp.where(x > _GROWS * change, x, change))
 
     return jtu.tree_map(size, sizes, change_of_rate, rates)
+
+
+def _with_slip(
+    machine: AbstractMachine, friction: ContactFriction, start: State, sizes: State
+) -> State:
+    """Return the sizes with those that friction gives the velocity along a stop: a body that stands
+    on it may have no other."""
+    body = machine.coordinates[stops_of(machine)[friction.stop].coordinate]
+    caused = friction.level * size_of(body.velocity, start, sizes)
+    push = push_of(machine.coordinates[friction.along], start)
+
+    def size(x: Array, p: Any) -> Array:
+        return jnp.where(x > _GROWS * jnp.abs(p) * caused, x, jnp.abs(p) * caused)
+
+    return jtu.tree_map(size, sizes, push)
 
 
 def extents_of(

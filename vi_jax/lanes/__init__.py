@@ -13,6 +13,7 @@ from .elementary import horner as horner
 from .elementary import pin as pin
 from .elementary import pin_flag as pin_flag
 from .elementary import sincos as sincos
+from .elementary import weighted_sum as weighted_sum
 from .loop import Emitted as Emitted
 from .loop import backend as backend
 from .loop import current_backend as current_backend

@@ -153,6 +153,16 @@ ELEMENTWISE["weighted_quotient"] = lambda t, p, d, a, b: weighted(t, a, div(t, a
 ELEMENTWISE["neg"] = lambda t, p, d, a: neg(t, a)
 for _name in ("eq", "ne", "lt", "le", "gt", "ge"):
     ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_name: compare(t, how, a, b, is_unsigned(d[0]))
+
+
+@elementwise("weighted_sum")
+def _weighted_sum(t: Text, params: dict, dtypes: list, *terms: Value) -> Value:
+    both = zip(terms, params["weights"], strict=True)
+    return functools.reduce(
+        functools.partial(add, t), (mul(t, x, t.constant(w, x.kind)) for x, w in both)
+    )
+
+
 IDENTITY_PRIMITIVES = "stop_gradient copy copy_p name pvary reshard pin".split()
 """Primitives that return their argument."""
 for _name in IDENTITY_PRIMITIVES:

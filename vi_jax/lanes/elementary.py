@@ -1,13 +1,14 @@
 """Functions whose best form differs between the backends."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import factorial, pi
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -45,6 +46,9 @@ def elementwise_primitive(
         return [aval] * results if several else aval
 
     def batched(args, dims, **params):
+        if all(d == 0 for d in dims) and len({x.shape for x in args}) == 1:
+            out = primitive.bind(*args, **params)
+            return out, [0] * results if several else 0
         front = [
             x[None] if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)
         ]
@@ -93,6 +97,38 @@ def _sincos_jvp(primals, tangents):
 
 
 sincos_p = elementwise_primitive("sincos", _by_tangent, _sincos_jvp, results=2)
+
+
+def weighted_sum(weights: Sequence[float], terms: Sequence[Array]) -> Array:
+    """Return Σ weight·term of arrays of one shape: one operation, to trace it quickly."""
+    return weighted_sum_p.bind(*terms, weights=tuple(map(float, weights)))
+
+
+def _sum_of_products(*terms, weights):
+    products = (lax.mul(x, lax.full_like(x, w)) for x, w in zip(terms, weights, strict=True))
+    return functools.reduce(lax.add, products)
+
+
+def _weighted_sum_jvp(primals, tangents, *, weights):
+    both = zip(weights, tangents, strict=True)
+    varied = [(w, t) for w, t in both if type(t) is not ad.Zero]
+    change = weighted_sum(*zip(*varied, strict=True)) if varied else tangents[0]
+    return weighted_sum(weights, primals), change
+
+
+weighted_sum_p = elementwise_primitive("weighted_sum", _sum_of_products, _weighted_sum_jvp)
+
+
+def _weighted_sum_transpose(cotangent: Any, *terms: Any, weights: Sequence[float]) -> list[Any]:
+    if type(cotangent) is ad.Zero:
+        return [None for _ in terms]
+    return [
+        weighted_sum([weight], [cotangent]) if ad.is_undefined_primal(x) else None
+        for weight, x in zip(weights, terms, strict=True)
+    ]
+
+
+ad.primitive_transposes[weighted_sum_p] = _weighted_sum_transpose
 
 
 def pin(tree: object) -> Any:

@@ -252,8 +252,16 @@ def _checked(what: str, treedef: object, tree: object, avals: list) -> list:
     return [jnp.asarray(x, aval.dtype) for x, aval in zip(leaves, avals, strict=True)]
 
 
+def _plain(x: Any) -> Any:
+    """Return a known number as one of NumPy."""
+    is_known = isinstance(x, jax.Array) and not isinstance(x, Tracer)
+    return np.asarray(x) if is_known and x.ndim == 0 else x
+
+
 def _consts_as_inputs(jaxprs: list[ClosedJaxpr], n: int) -> tuple[list[ClosedJaxpr], list]:
-    """Return the jaxprs with their constant arrays as inputs after the first `n`, and these."""
+    """Return the jaxprs with their constant arrays as inputs after the first `n`, and these.
+    Single numbers stay constants."""
+    jaxprs = [jaxpr.replace(consts=[*map(_plain, jaxpr.consts)]) for jaxpr in jaxprs]
     consts: list[Any] = []
     for jaxpr in jaxprs:
         for x in jaxpr.consts:

@@ -1,4 +1,4 @@
-"""Machines: states, coordinates, contacts, events, drives, and the paper's scene."""
+"""Machines in general: states, coordinates, contacts, events and cycles."""
 
 # The names that other packages import.
 # ruff: noqa: F401, I001
@@ -9,9 +9,9 @@ from .base import (
     names_on, number_on, renews,
 )
 from .clocks import (
-    as_logged, at_section, clock_in_words, clock_word, convert_start, cycle_time, cycles_in_words,
-    frequency_ratio, in_clock, in_cycle_clock, in_cycle_state, is_alive, is_in_range,
-    logged_turn, may_rest, phase_at, prepared, scales_known,
+    Prepared, as_logged, at_section, clock_in_words, clock_word, convert_start, cycle_time,
+    cycles_in_words, frequency_ratio, in_clock, in_cycle_clock, in_cycle_state, is_alive,
+    is_in_range, logged_turn, may_rest, phase_at, prepared, scales_known,
 )
 from .contact_forces import contact_forces
 from .contacts import (
@@ -23,39 +23,38 @@ from .coordinates import (
     without_turns, wrap_angles,
 )
 from .cycles import Turn, counter_of, counts_turns, falling, rising, turn_of
-from .declared import (
-    at_stop, chosen_stop, clock_of, has_own_modes, is_builtin, limited_in, others_of,
-    outcomes_of, overridden, section_in, stops_of, stops_on, switches_of, with_earlier_clock,
-)
 from .delay import (
     Past, delays_valid, has_delays, history_before, lags_of, longest_delay, reading,
     recorded_numbers, with_some_past, without_past,
 )
-from .delay_chain import delay_chain, history_in, machine_of_chain
-from .drives import (
-    AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, OscillatorState, Slide,
-    SliderCrank,
-)
+from .delay_chain import delay_chain, history_in, machine_of_chain, without_history
 from .event import AbstractEvent, AbstractSwitch
 from .events import (
-    HybridState, Reset, Switch, after_event, begin_modes, begun, constant_modes,
-    event_of, events_of, guard_of, has_contact_friction, history_of, holds_anywhere,
-    is_autonomous, is_compound, jump_of,
-    mode_number, modes_at_start, modes_of, own_modes, raveled, replaced, section_number,
-    sides_of, struck_modes, with_modes, without_modes,
+    Reset, Switch, after_event, begin_modes, event_of, guard_of, has_contact_friction,
+    holds_anywhere, is_autonomous, is_compound, jump_of, section_number, sides_of, struck_modes,
 )
 from .friction import (
     ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_modes, shared_loads,
 )
-from .linear import LinearMachine, ModalMachine, Prepared, StructureState, modal
-from .mechanical import Mechanical, solved
-from .numbers import (
-    PLAIN, QUANTITIES, Shown, Stated, Summarized, attributes, by_name, check_again, check_leaf,
-    check_name, components, drive_speed, first_few, in_brackets, in_rows, in_unit, in_words, leaf,
-    leaf_names, name_in, near_names, number_in_words, plain, quantity_of, size_of, state_in_words,
-    stated, unit_of, units_of, with_leaf, with_leaves, with_unit, with_units,
+from .leaves import (
+    by_name, check_again, check_leaf, check_name, components, first_few, in_rows, leaf, leaf_names,
+    near_names, size_of, with_leaf, with_leaves,
 )
-from .scene import Parameters, Scene
+from .mechanical import Mechanical, solved
+from .modes import (
+    HybridState, begun, constant_modes, history_of, modes_at_start, modes_of, own_modes, raveled,
+    replaced, with_modes, without_modes,
+)
+from .overrides import is_builtin, overridden
+from .parts import (
+    at_stop, chosen_stop, clock_of, events_of, has_own_modes, limited_in, mode_number, others_of,
+    outcomes_of, section_in, stops_of, stops_on, switches_of, with_earlier_clock,
+)
+from .printing import Shown, Summarized, in_words, known, number_in_words, plain, state_in_words
 from .settle import strike
 from .state import State, like
 from .stop import AbstractContactLaw, HuntCrossley, PowerLaw, RigidStop, SoftStop, stop_in_words
+from .units import (
+    PLAIN, QUANTITIES, Stated, attributes, drive_speed, in_brackets, in_unit, name_in, quantity_of,
+    stated, unit_of, units_of, with_unit, with_units,
+)

@@ -24,25 +24,21 @@ from .._checks import fields_with, number, require
 from .._types import Machine, Scalar, State
 from .coordinates import Coordinate, coordinate_by_name
 from .cycles import Turn, at_intervals, counter_of, counts_turns
-from .declared import (
-    defines,
-    derived,
-    overridden,
-    stops_of,
-    switches_of,
-    with_own_defaults,
-    with_static,
-)
 from .event import AbstractEvent, AbstractSwitch, Section
 from .events import Reset
 from .friction import ContactFriction, DryFriction, joined
-from .numbers import PLAIN, Shown, components, unit_in
+from .leaves import components
+from .overrides import defines, derived, overridden, with_own_defaults, with_static
+from .parts import stops_of, switches_of
+from .printing import Shown
 from .stop import RigidStop, SoftStop, Wall
+from .units import PLAIN, unit_in
 
 # Required members, each with advice for an error message.
 _REQUIRED = {
     "cycle": "write `cycle: float = …` in the class, its length in `s`, or a property",
     "field": "write `def field(self, s, state)`, which returns the rate of each part of the state",
+    "force": "write `def force(self, t, q, v)`, which returns the force on each coordinate by name",
 }
 
 

@@ -9,10 +9,11 @@ import jax.tree_util as jtu
 
 from .._types import Flag, Machine, Scalar, State
 from .contacts import field_in, velocity_change
-from .declared import limited_in, stops_of, switches_of
-from .events import begin_modes, modes_of, without_modes
+from .events import begin_modes
 from .friction import frictions_in, settled_forces
-from .numbers import size_of
+from .leaves import size_of
+from .modes import modes_of, without_modes
+from .parts import limited_in, stops_of, switches_of
 from .state import State as Named
 from .stop import SoftStop, stop_in_words
 

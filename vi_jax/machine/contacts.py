@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from .._types import Flag, Machine, Scalar, Scalars, State
 from .coordinates import Row
-from .declared import friction_on, limited_in, stops_of, switches_of
+from .parts import friction_on, limited_in, stops_of, switches_of
 from .settle import Strike
 from .state import like
 
@@ -309,9 +309,10 @@ def check_takes(
         signature.bind(*arguments)
     except TypeError as error:
         and_modes = f" and {modes} modes (of switches, then the machine's own)" if modes else ""
+        takes = ", ".join(f"`{name}`" for name in signature.parameters) or "nothing"
         needed = [x.name for x in signature.parameters.values() if x.default is x.empty]
         more = needed[len(arguments) :] if "missing" in str(error) else []
-        text = f"{whose} must take {first}{and_modes}: {error}."
+        text = f"{whose} must take {first}{and_modes}, but takes {takes}."
         if more:
             modes_ = ", ".join(f"{name}=0.0" for name in more)
             text += f" If {' and '.join(more)} are modes, declare them: `modes = dict({modes_})`."

@@ -12,7 +12,7 @@ import numpy as np
 from jax.lax import stop_gradient
 
 from .._types import Machine, Scalar, State
-from .numbers import components, split_index
+from .leaves import components, split_index
 
 
 class Row(NamedTuple):

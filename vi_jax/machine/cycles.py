@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from .._checks import concrete
 from .._types import Scalar, State
 from .coordinates import component, has_component, with_component, wrap_angles
-from .declared import with_static
 from .event import AbstractEvent, Section, TurnEnd
+from .overrides import with_static
 
 
 class Counter(abc.ABC):

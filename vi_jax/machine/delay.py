@@ -22,8 +22,8 @@ from .._types import Machine, Scalar, Scalars, State, Vector
 from ..lanes import dependent_results
 from .base import AbstractMachine, cached_in_trace
 from .contacts import check_takes, field_in, shown_modes
-from .declared import overridden, with_static
 from .events import Reset, Switch, after_event, begin_modes, guard_of, section_number
+from .overrides import overridden, with_static
 from .state import State as Named
 from .state import like
 

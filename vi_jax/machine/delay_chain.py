@@ -14,7 +14,6 @@ from .._checks import count
 from .._types import Scalar, State, Vector
 from .base import AbstractMachine
 from .contacts import shown_modes
-from .declared import overridden
 from .delay import (
     Past,
     as_state,
@@ -27,7 +26,9 @@ from .delay import (
     recorded_numbers,
     without_past,
 )
-from .events import begin_modes, history_of, modes_of, with_modes, without_modes
+from .events import begin_modes
+from .modes import history_of, modes_of, with_modes, without_modes
+from .overrides import overridden
 from .state import State as Named
 
 _NAME = "history"
@@ -150,6 +151,11 @@ def _chained(self: Any, state: Any) -> Any:
 def machine_of_chain(machine: Any) -> Any:
     """Return the machine with delays of a chain, or `None` for another machine."""
     return without_past(machine) if isinstance(getattr(machine, "_past", None), _Chain) else None
+
+
+def without_history(machine: Any, state: Any) -> Any:
+    """Return a state of a chain without its history; of another machine unchanged."""
+    return state if machine_of_chain(machine) is None else machine._past.own(state)
 
 
 def history_in(machine: Any, state: Any) -> Callable[[Scalar], Vector]:

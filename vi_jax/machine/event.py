@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Machine, Scalar, Scalars, State
-from .numbers import Shown
+from .printing import Shown
 
 Modes = Scalars
 

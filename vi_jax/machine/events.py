@@ -5,8 +5,7 @@ An argument `number` is that of an event. `modes` are all of the machine, before
 `contact` is as in `EventContext`.
 """
 
-import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -14,32 +13,26 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
 
 from .._checks import one_of
-from .._types import Machine, Scalar, Scalars, State, Vector
+from .._types import Machine, Scalar, Scalars, State
 from .contacts import call_checked, field_in, impact_on, rate_of, shown_modes
-from .declared import (
-    declared_modes,
-    friction_on,
-    has_own_modes,
-    limited_in,
-    others_of,
-    stops_of,
-    switches_of,
-    with_static,
-)
 from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
 from .friction import Friction, frictions_in, settled_modes
-from .numbers import Shown, size_of
+from .leaves import size_of
+from .modes import constant_modes, modes_after, modes_at_start
+from .overrides import with_static
+from .parts import (
+    events_of,
+    friction_on,
+    limited_in,
+    mode_number,
+    stops_of,
+    switches_of,
+)
 from .settle import strike
 from .state import changed
-
-
-def events_of(machine: Machine) -> tuple[AbstractEvent, ...]:
-    """Return all events by number: stops, switches, other events, and the section."""
-    return (*stops_of(machine), *switches_of(machine), *others_of(machine), machine._end)
 
 
 def is_autonomous(machine: Machine, state: State) -> bool:
@@ -122,16 +115,6 @@ def is_compound(machine: Machine) -> bool:
     return len(limited_in(machine)) > 1 or has_contact_friction(machine)
 
 
-def mode_number(machine: Machine, number: int) -> int:
-    """Return the index of an event's mode among the machine's modes."""
-    return sum(event.holds_mode for event in events_of(machine)[:number])
-
-
-def own_modes(machine: Machine, modes: Modes) -> Modes:
-    """Return the modes of the machine that belong to no event."""
-    return modes[mode_number(machine, len(events_of(machine))) :]
-
-
 def event_of(
     machine: Machine, number: int, modes: Modes, contact: Scalars, loads: Any = None
 ) -> tuple[AbstractEvent, slice, dict[str, EventContext]]:
@@ -145,16 +128,18 @@ def event_of(
 
 
 def begin_modes(
-    machine: Machine, s: Scalar, state: State, own: Sequence[Any] | None = None
-) -> Modes:
+    machine: Machine, s: Scalar, state: State, own: Sequence[Any] | None = None, *,
+    settles: bool = True,
+) -> Modes:  # fmt: skip
     """Return the initial modes of a motion in `state`: those of events, in their order, then the
-    machine's own, which are `own` if that is given."""
+    machine's own, which are `own` if that is given. Unless it `settles`, no mode depends on
+    others."""
     state = jtu.tree_map(jnp.asarray, state)  # a start may hold Python's numbers
     mode_events = [event for event in events_of(machine) if event.holds_mode]
     own = modes_at_start(machine, s, state) if own is None else own
     modes = [*(event.begin(machine, s, state) for event in mode_events), *own]
     modes = constant_modes(modes, s)
-    if any(event.needs_all_modes for event in mode_events):  # their modes depend on the others
+    if settles and any(event.needs_all_modes for event in mode_events):
         modes = struck_modes(machine, s, state, modes)
     return modes
 
@@ -190,113 +175,6 @@ def struck_modes(
 def holds_anywhere(machine: Machine) -> bool:
     """Return whether there is friction that may hold a body anywhere."""
     return any(x.is_dry for x in switches_of(machine))
-
-
-def modes_at_start(machine: Machine, s: Scalar, state: State) -> tuple[Any, ...]:
-    """Return the machine's own initial modes of a motion that begins in `state`."""
-    modes = machine.modes
-    return _values(modes(s, state) if callable(modes) else declared_modes(machine))
-
-
-def _values(modes: Any) -> tuple[Any, ...]:
-    if isinstance(modes, Mapping):
-        return tuple(modes.values())
-    return tuple(modes) if isinstance(modes, tuple | list) else (modes,)
-
-
-def modes_after(machine: Machine, found: Any, modes: Modes, whose: str) -> tuple[Any, ...]:
-    """Return the machine's own modes after an event, for which a function returned `found`: all, or
-    a dictionary of those that change."""
-    names = tuple(declared_modes(machine))
-    if not isinstance(found, Mapping) or not names:
-        return _values(found)
-    extra = [name for name in found if name not in names]
-    if extra:
-        raise TypeError(
-            f"{whose} returned the mode {extra[0]!r}, which the machine does not have. Its `modes` "
-            f"are {', '.join(names)}."
-        )
-    pairs = zip(names, own_modes(machine, modes), strict=True)
-    return tuple(found.get(name, old) for name, old in pairs)
-
-
-def constant_modes(modes: Sequence[Any], s: Scalar) -> Modes:
-    """Return modes as floats without derivatives, as the loop carries them."""
-    return tuple(stop_gradient(jnp.asarray(mode, jnp.result_type(s))) for mode in modes)
-
-
-class HybridState(Shown):
-    """A state together with the machine's discrete modes, a start that continues another motion.
-
-    A machine with discrete modes (`AbstractMachine.modes`) is not determined by its state alone.
-    Its `Run.last` and `Orbit.state` are of this class. The components are those of `state`:
-    `run.last.Y` is `run.last.state.Y`.
-
-    **Arguments:**
-
-    - `state`: the state, as the machine's field receives it.
-    - `modes`: the machine's discrete modes, a tuple in the order of its `modes`.
-    - `history`: the history of a machine with delays, as a run returns it; by default `None`, the
-      machine's `before`.
-    """
-
-    state: Any
-    modes: tuple[Any, ...]
-    history: Any = None
-
-    def __getattr__(self, name: str) -> Any:
-        if name in ("state", "modes", "history") or name.startswith("__"):
-            raise AttributeError(name)
-        return getattr(self.state, name)
-
-    def __getitem__(self, place: Any) -> Any:
-        return self.state[place]
-
-
-def without_modes(state: State) -> State:
-    """Return the state without modes."""
-    return state.state if isinstance(state, HybridState) else state
-
-
-def modes_of(state: State) -> tuple[Any, ...] | None:
-    """Return the machine's own modes in a state, or `None` if it contains no modes."""
-    return state.modes if isinstance(state, HybridState) else None
-
-
-def history_of(state: State) -> Any:
-    """Return the history of a machine with delays in a state, or `None`."""
-    return state.history if isinstance(state, HybridState) else None
-
-
-def with_modes(state: State, modes: tuple[Any, ...] | None, history: Any = None) -> State:
-    """Return the state with these own modes of the machine, and this history; unchanged without
-    both."""
-    return HybridState(state, modes or (), history) if modes or history is not None else state
-
-
-def replaced(state: State, new: State) -> State:
-    """Return another state in the same modes, with the same history."""
-    return dataclasses.replace(state, state=new) if isinstance(state, HybridState) else new
-
-
-def begun(machine: Machine, state: State, axes: int = 0) -> State:
-    """Return the state with a motion's initial modes, unless it has some or the machine none."""
-    if isinstance(state, HybridState) or not has_own_modes(machine):
-        return state
-
-    def begin(state: State) -> Any:
-        zero = jnp.zeros_like(machine.position(state))
-        return constant_modes(modes_at_start(machine, zero, state), zero)
-
-    for _ in range(axes):
-        begin = jax.vmap(begin)
-    return with_modes(state, begin(state))
-
-
-def raveled(state: State) -> tuple[Vector, Callable[[Vector], State]]:
-    """Return `ravel_pytree` of a state whose modes are no unknowns: they stay unchanged."""
-    row, unravel = ravel_pytree(without_modes(state))
-    return row, lambda row: replaced(state, unravel(row))
 
 
 class Switch(AbstractSwitch):
@@ -436,6 +314,13 @@ class Reset(AbstractEvent):
         direction: str = "rising",
         name: str = "",
     ):
+        parts = dict(guard=guard, reset=reset, when=when, modes=modes, value=value)
+        for part, given in parts.items():
+            if not callable(given) and (given is not None or part == "guard"):
+                raise TypeError(
+                    f"Argument `{part}` of a Reset must be a function, as `lambda m, t, z: ...`, "
+                    f"but got {given!r}."
+                )
         self._guard, self._reset, self._when = guard, reset, when
         self._modes, self._value = modes, value
         self.ends_cycle, self.ends, self.name = bool(ends_cycle), str(ends), str(name)

@@ -37,9 +37,10 @@ from .contacts import (
     velocity_change,
 )
 from .coordinates import Row
-from .declared import at_stop, hashable, limited_in, stops_of, switches_of
 from .event import AbstractSwitch, EventContext
-from .numbers import size_of
+from .leaves import size_of
+from .overrides import hashable
+from .parts import at_stop, limited_in, stops_of, switches_of
 from .settle import Contacts, Settled, released_share, settle
 from .state import with_components
 

@@ -10,11 +10,13 @@ import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import pi
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from .._checks import concrete
 from .._types import Scalar, State
@@ -22,8 +24,8 @@ from ..lanes import dependent_results
 from .base import AbstractMachine, cached_in_trace, contacts_in
 from .contacts import check_takes
 from .coordinates import Coordinate, Row, component
-from .declared import overridden
-from .numbers import split_index
+from .leaves import split_index
+from .overrides import overridden
 from .state import State as Named
 from .state import like
 from .stop import Wall
@@ -79,11 +81,16 @@ class Mechanical(AbstractMachine):
                 f"Argument `v` must be velocities by name, dict({names[0]}=...): {v!r}."
             )
         v = dict(vars(v) if isinstance(v, Named) else v)
-        wrong = [x for x in (*places, *v) if x not in names]
-        if wrong:
+        wrong = next((x for x in (*places, *v) if x not in names), None)
+        if wrong in self.q_names:
             raise ValueError(
-                f"{wrong[0]!r} is not one of the coordinates {', '.join(names)}"
-                f"{', which have no prescribed motion' * (len(names) < len(self.q_names))}."
+                f"The motion of {wrong!r} is prescribed by the machine. Leave it out: a state has "
+                f"free values of {', '.join(names)} alone."
+            )
+        if wrong is not None:
+            raise ValueError(
+                f"{wrong!r} is not one of the coordinates {', '.join(names)}. Give velocities by "
+                f"name in `v`: `at({names[0]}=0.1, v=dict({names[0]}=1.0))`."
             )
         zeros = {x: jnp.zeros(shape) if shape else 0.0 for x, shape in self.q_shapes.items()}
         at, rate = zeros | places, zeros | v
@@ -242,6 +249,7 @@ class Mechanical(AbstractMachine):
         return list(found.values())
 
     def _coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
+        on = _as_gap(self, on)
         return Coordinate(
             functools.partial(_position, self, on),
             functools.partial(_velocity, self, on),
@@ -285,11 +293,58 @@ def _coordinate_name(machine: Mechanical, on: Any) -> str | None:
     return name
 
 
+class _Gap(NamedTuple):
+    """A function that contacts are `on`, or have friction `along`, and its number among these.
+
+    A step of a block on two corners asks for rates and pushes of its gaps some hundred times.
+    Inline they and their derivatives were half of the equations of its `find_orbit`; by its number
+    a function is traced once for equal machines.
+    """
+
+    function: Callable[[Named], Any]
+    number: int | None
+
+    def __call__(self, q: Named) -> Any:
+        return self.function(q)
+
+
+@cached_in_trace
+def _functions_in(machine: Any) -> tuple[Any, ...]:
+    parts = contacts_in(machine)
+    return tuple(y for x in parts for y in map(vars(x).get, ("on", "along")) if callable(y))
+
+
+def _as_gap(machine: Mechanical, on: Any) -> Any:
+    """Return what a contact is `on`: a function as a `_Gap`."""
+    if not callable(on):
+        return on
+    return _Gap(on, next((i for i, x in enumerate(_functions_in(machine)) if x is on), None))
+
+
+def _once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Trace a function of a machine, what a contact is on, and a state once for each gap."""
+
+    @eqx.filter_jit
+    def of_number(machine: Mechanical, number: int, state: Any) -> Any:
+        return function(machine, _functions_in(machine)[number], state)
+
+    @functools.wraps(function)
+    def of_gap(machine: Mechanical, on: Any, state: Any) -> Any:
+        traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((machine, state)))
+        if traced and isinstance(on, _Gap) and on.number is not None:
+            return of_number(machine, on.number, state)
+        return function(machine, on, state)
+
+    return of_gap
+
+
+@_once
 def _position(machine: Mechanical, on: Any, state: State) -> Any:
     name = _coordinate_name(machine, on)
     return on(machine.places(state)) if name is None else component(name, state)
 
 
+@_once
 def _velocity(machine: Mechanical, on: Any, state: State) -> Any:
     name, v = _coordinate_name(machine, on), state.v
     if name is not None:
@@ -327,6 +382,7 @@ def _rate_along(function: Callable[[Named], Any], q: Named, name: str, speed: An
     return jax.jvp(lambda x: function(q.replace(**{name: x})), (getattr(q, name),), (speed,))[1]
 
 
+@_once
 def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any, list[Any]]:
     """Return M⁻¹Jᵀ/(J M⁻¹Jᵀ), the change of the velocities for a unit change of a gap's velocity;
     the effective mass 1/(J M⁻¹Jᵀ); and J."""

@@ -7,7 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .numbers import in_words, known, split_index
+from .leaves import split_index
+from .printing import in_words, known
 
 
 class State:

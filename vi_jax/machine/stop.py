@@ -31,10 +31,12 @@ from .._checks import (
 )
 from .._types import Machine, Number, Scalar, State
 from .contacts import push_of, shown_modes
-from .declared import hashable, stops_of, switches_of
 from .event import AbstractEvent, AbstractSwitch, Modes
-from .events import modes_after, struck_modes
-from .numbers import Shown
+from .events import struck_modes
+from .modes import modes_after
+from .overrides import hashable
+from .parts import stops_of, switches_of
+from .printing import Shown
 
 
 def _unless_tiny(V: Number) -> Any:

@@ -23,8 +23,9 @@ from .._checks import (
     require_ranges,
 )
 from .._types import Scalar
-from ..machine import LinearMachine, RigidStop
+from ..machine import RigidStop
 from ._base import number_field, stops_at
+from .linear import LinearMachine
 
 
 @cache

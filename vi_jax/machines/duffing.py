@@ -8,8 +8,9 @@ import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, number
 from .._types import Number, Scalar
-from ..machine import OscillatorState, RigidStop
+from ..machine import RigidStop
 from ._base import ForcedMachine, draw_supported_body, number_field, stops_at
+from .drives import OscillatorState
 
 
 class Duffing(ForcedMachine):

@@ -20,8 +20,9 @@ from .._checks import (
     require_ranges,
     tuple_of,
 )
-from ..machine import LinearMachine, RigidStop
+from ..machine import RigidStop
 from ._base import number_field
+from .linear import LinearMachine
 
 # The largest asymmetry of a matrix, relative to its largest entry, that is rounding: a choice.
 _SYMMETRY = 1e-12

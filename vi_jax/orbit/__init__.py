@@ -12,8 +12,9 @@ from .find import find_orbit, is_equilibrium
 from .grazing import SCENARIOS, Grazing, Motions, grazing
 from .kinds import KINDS
 from .results import (
-    ORBIT_RESULTS, STABILITY, Orbit, Orbits, MotionSections, check_multipliers, complex_in_words,
-    distance, distinct_among, distinct_orbits, in_one_line, multipliers_of, stability_of,
+    ORBIT_RESULTS, STABILITY, Orbit, Orbits, MotionSections, check_multipliers, distance,
+    distinct_among, distinct_orbits, in_one_line, multipliers_in_words, multipliers_of,
+    stability_of,
 )
 from .root_finders import AbstractRootFinder, Gradient, Newton
 from .special import Point

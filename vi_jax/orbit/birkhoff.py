@@ -4,14 +4,19 @@ On quasi-periodic motions they converge faster than any power of the number of s
 Sander and Yorke 2017), on chaotic ones as slowly as plain averages.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import Scalar
+from .._types import Number, Scalar
 
-# A motion whose sections differ by less than this share of their size does not turn: a choice.
+# A component whose spread is below this share of its size stands still, and has no say: a choice.
 _STILL = 1e-9
+
+# The spread by errors of a method, as a multiple of its `wander`: a choice.
+_WANDERS = 10.0
 
 # Averages agree to so many digits at most, the rounding of double precision.
 _MOST = 16.0
@@ -24,42 +29,56 @@ def weights(number: int) -> np.ndarray:
     return weight / weight.sum()
 
 
-def without_angles(rows: Float[Array, "sections states"], angles: np.ndarray | None) -> Array:
-    """Return the rows with the sine and cosine of each angle in its place."""
+def without_angles(
+    rows: Float[Array, "sections states"], sizes: Any, angles: np.ndarray | None
+) -> Array:
+    """Return the rows in units of `sizes` (`row_sizes`), with the sine and cosine of each angle in
+    its place."""
+    rows = rows / sizes  # those of angles are 1
     if angles is None:
         return rows
     across, around = rows[:, ~angles], rows[:, angles]
     return jnp.concatenate([across, jnp.sin(around), jnp.cos(around)], axis=1)
 
 
-def agreement(rows: Float[Array, "sections states"]) -> Scalar:
+def agreement(rows: Float[Array, "sections states"], wander: Number = 0.0) -> Scalar:
     """Return the number of digits to which averages over both halves of the sections agree: those
-    of each component and of its square, relative to their spread."""
+    of each component that moves and of its square, relative to their spread. **Arguments:** rows
+    from `without_angles`; the `wander` of their method."""
     values = jnp.concatenate([rows, rows**2], axis=1)
     half = len(rows) // 2
     difference = jnp.asarray(weights(half)) @ (values[:half] - values[half : 2 * half])
-    return digits_of(difference, jnp.std(values, axis=0), jnp.mean(values, axis=0))
+    return digits_of(difference, jnp.std(values, axis=0), jnp.mean(values, axis=0), wander)
 
 
-def digits_of(difference: Array, spread: Array, mean: Array) -> Scalar:
-    """Return the number of digits to which averages agree that differ by this, relative to their
-    spread; a spread that is rounding of the mean counts as that."""
+def digits_of(difference: Array, spread: Array, mean: Array, wander: Number = 0.0) -> Scalar:
+    """Return the number of digits to which averages of components and their squares agree that
+    differ by this, relative to their spread; one that is rounding of the mean counts as that."""
+    number = len(mean) // 2
+    moves = jnp.tile(_moves(spread[:number], mean[:number], wander), 2)
     size = spread + _STILL * jnp.abs(mean)
-    share = jnp.max(jnp.abs(difference) / jnp.where(size > 0, size, 1.0))
+    share = jnp.max(jnp.where(moves, jnp.abs(difference) / jnp.where(moves, size, 1.0), 0.0))
     return jnp.minimum(-jnp.log10(share + 10.0**-_MOST), _MOST)
 
 
-def rotation_number(rows: Float[Array, "sections states"]) -> Scalar:
+def _moves(spread: Array, size: Array, wander: Number) -> Array:
+    still = jnp.maximum(_STILL, _WANDERS * jnp.asarray(wander, spread.dtype))
+    return spread > still * jnp.maximum(jnp.abs(size), 1.0)
+
+
+def rotation_number(rows: Float[Array, "sections states"], wander: Number = 0.0) -> Scalar:
     """Return the mean angle, in turns from 0 to 1/2, by which sections move on around their mean.
-    It is NaN for a fixed point.
+    It is NaN for a fixed point, and for states of one number. **Arguments:** as of `agreement`.
 
     The angle is seen in the plane of the two directions of largest spread. Steps of the angle are
     counted from the middle of the widest gap between them, so a curve that is not a circle matters
     only if its steps leave no gap.
     """
+    if rows.shape[1] < 2:
+        return jnp.full((), jnp.nan, rows.dtype)
     weight = jnp.asarray(weights(len(rows)))
     centred, size = rows - weight @ rows, jnp.std(rows, axis=0)
-    moves = size > _STILL * jnp.max(jnp.abs(rows), axis=0)
+    moves = _moves(size, jnp.max(jnp.abs(rows), axis=0), wander)
     scaled = jnp.where(moves, centred / jnp.where(moves, size, 1.0), 0.0)
     _, directions = jnp.linalg.eigh(scaled.T @ scaled)
     x, y = (scaled @ directions[:, -2:]).T

@@ -26,7 +26,8 @@ from .._checks import count
 from .._programs import compiled
 from .._types import Flag, Number, Scalar
 from ..flow import lack_of_closed_form
-from ..machine import IdealDrive, OscillatorState, Scene, Shown
+from ..machine import Shown
+from ..machines import IdealDrive, OscillatorState, Scene
 from .results import eigenvalues
 
 # Grid points per drive cycle that bracket turning points: a choice, for ζ well above 1/256.

@@ -21,6 +21,7 @@ from ..flow import (
     FixedStep,
     MethodLike,
     as_floats,
+    check_finite,
     check_reals,
     check_values,
     chosen,
@@ -186,6 +187,8 @@ def map_state(machine: AbstractMachine, state: State, name: str = "state") -> St
             "Argument `machine` must count its cycles by its independent variable, but its state "
             "has a clock."
         )
+    if not axes_of(machine, state):
+        check_finite(name, state)
     check_values(machine, state)
     state = as_floats(machine, state)
     if modes is None:

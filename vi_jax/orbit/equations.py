@@ -9,7 +9,7 @@ motion; the sign of V⁻ or of the clearance shows this. (`hspo` of COCO has the
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial, reduce
 from typing import Any, NamedTuple
 
@@ -608,7 +608,10 @@ class Shooting(eqx.Module):
         low, high, nearest, pull = turns
         i, j = jnp.argmin(nearest.margin), jnp.argmin(pull.margin)
         nearest, pull = (jax.tree.map(lambda x, k=k: x[k], a) for a, k in ((nearest, i), (pull, j)))
-        order_of_events = self._order_margin(machine, clock, ends - clock, states, sizes)
+        margins = self.order_margins(machine, clock, ends - clock, states, sizes)
+        order_of_events = reduce(
+            jnp.minimum, (x[0] for x in margins), jnp.full_like(period, jnp.inf)
+        )
         totals = jax.tree.map(jnp.sum, integrals)
         time = totals.pop(TIME)
         timed = self.autonomous or machine.pace(clock[0], self.unravel(states[0])) is not None
@@ -642,12 +645,14 @@ class Shooting(eqx.Module):
         sizes = jnp.abs(slopes) @ self.sizes[1:] + jnp.abs(s_slope) * self.sizes[0]
         return stop_gradient(jnp.where((sizes > 0) & jnp.isfinite(sizes), sizes, 1.0))
 
-    def _order_margin(
-        self, machine: AbstractMachine, clock: Array, lengths: Array, states: Array, sizes: Array
-    ) -> Scalar:
-        least = jnp.asarray(jnp.inf, clock.dtype)
+    def order_margins(
+        self, machine: AbstractMachine, clock: Array, lengths: Any, states: Array, sizes: Any
+    ) -> Iterator[tuple[Scalar, int, int]]:
+        """Yield margins (see `order_margin`), each with the index of an event in the motion and the
+        number of the other one. `sizes` are `guard_sizes` after each event."""
         for i, event in enumerate(self.events):
-            least, state = jnp.minimum(least, lengths[i]), self.unravel(states[i])
+            yield lengths[i], i, self.events[(i + 1) % self.legs].number
+            state = self.unravel(states[i])
             before, contact = (
                 tuple(jnp.asarray(mode, clock.dtype) for mode in per_leg[i - 1])
                 for per_leg in (self.modes, self.contacts)
@@ -657,11 +662,10 @@ class Shooting(eqx.Module):
                 if is_excluded or 1.0 + number in self.contacts[i - 1]:
                     continue
                 margin = -guard_of(machine, number, clock[i], state, before, contact)
-                margin = margin / sizes[i - 1, number] * self.sizes[0]
+                margin = margin / sizes[i - 1][number] * self.sizes[0]
                 if other.from_below:  # if it is beyond zero, it must come from below again first
                     margin = jnp.where(margin > 0, margin, jnp.inf)
-                least = jnp.minimum(least, margin)
-        return least
+                yield margin, i, number
 
     def _time_left(self, machine: AbstractMachine, i: int, last: Chatter, until: Scalar) -> Scalar:
         """Return the time from the end of a chatter to the next event other than its release."""

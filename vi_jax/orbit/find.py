@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float, Int
 
-from .._checks import concrete, count, flag
+from .._checks import count, flag
 from .._messages import warning_once
 from .._programs import compiled
 from .._types import Flag, Number, Scalar, State, Vector
@@ -38,7 +38,6 @@ from ..flow import (
 from ..machine import (
     AbstractMachine,
     HybridState,
-    Scene,
     angles_in,
     begin_modes,
     frequency_ratio,
@@ -52,6 +51,7 @@ from ..machine import (
     with_modes,
     without_modes,
 )
+from ..machines import Scene
 from .cycle_map import CycleMap, axes_of, batch_together, cycle_map, forward_jacobian, map_state
 from .delay import as_chain, with_delay_error
 from .results import ORBIT_RESULTS, Orbit, distance, multipliers_of, trimmed
@@ -484,11 +484,6 @@ def _check_guess(machine: AbstractMachine, state: State) -> None:
             "Argument `guess` must hold the numbers of a state, or rows of one length for as many "
             f"guesses, but holds shapes {all_shapes}."
         )
-    for path, leaf in jtu.tree_leaves_with_path(state):
-        numbers = concrete(leaf)
-        if numbers is not None and not is_batch and not np.isfinite(numbers).all():
-            name = jtu.keystr(path).lstrip(".")
-            raise ValueError(f"Argument `guess` must be finite, but its {name} is {numbers}.")
 
 
 @compiled

@@ -21,7 +21,7 @@ from .corrector import on_host
 from .equations import Shooting
 from .flight import Event
 from .local_map import LocalGrazing, LocalMap, graze_at
-from .results import complex_in_words
+from .results import multipliers_in_words
 from .special import Point
 
 # Longest period that is sought, and the number of iterates in which it is sought.
@@ -484,7 +484,7 @@ class Grazing(Summarized):
     def summary(self) -> str:
         """Describe the stop, the local map, its attractor, and the agreement of the machine."""
         at = in_unit(f"{self.value:.10g}", dict(self.units), self.parameter)
-        values = ", ".join(complex_in_words(z, 6, 1e-9) for z in self.multipliers)
+        values = ", ".join(multipliers_in_words(self.multipliers, 6, 1e-9))
         entries = ", ".join(f"{e:.4g}" for e in self.entries[:6])
         orders = ", ".join(f"{x:g}" for x in self.order)
         lines = [

@@ -39,6 +39,7 @@ from ..flow import (
 from ..lanes import pin
 from ..machine import (
     AbstractMachine,
+    Reset,
     Summarized,
     angles_in,
     clock_word,
@@ -49,11 +50,13 @@ from ..machine import (
     is_autonomous,
     labels_in,
     nearest_images,
+    others_of,
     state_in_words,
     stop_in_words,
     stops_of,
     units_of,
     with_units,
+    without_history,
     without_modes,
 )
 
@@ -71,6 +74,9 @@ class STABILITY(NamedEnumeration):
 
 # A modulus is 1 within this, in double precision: a choice, ten times `Newton`'s tolerance.
 NEUTRAL = 1e-9
+
+# A multiplier below so many roundings of the largest one, or of 1, is printed as 0: a choice.
+_ROUNDINGS = 16.0
 
 
 def multipliers_of(monodromy: Float[Array, "*batch n n"]) -> Complex[Array, "*batch n"]:
@@ -151,8 +157,7 @@ class ORBIT_RESULTS(NamedEnumeration):
     inadmissible = "The motion found would pass through a stop."
     no_orbit = (
         "The residual did not fall below the tolerance: no orbit was found from this guess; begin "
-        "nearer to one, such as the end of a long simulation. Events that a reset sets off at the "
-        "same instant change the number of cycles (see the event log)."
+        "nearer to one, such as the end of a long simulation, or search with other `cycles`."
     )
     grazing = (
         "No orbit was found: the search ended beside a grazing, where the cycle map has no "
@@ -366,9 +371,10 @@ class Orbit(Summarized):
             return f"No orbit: {reason} Residual {float(self.residual):.3g}.{_advice(self)}"
         count, cycles, units = int(self.impacts), int(self.cycles), units_of(self.machine)
         period = cycles_in_words(self.machine, cycles)
+        own = without_history(self.machine, without_modes(self.state))
         lines = [
             f"Orbit of period {period} with {hits_in_words(self)}, {STABILITY[self.stability]}",
-            f"  section: {state_in_words(without_modes(self.state), 9, units)}",
+            f"  section: {state_in_words(own, 9, units)}",
             f"  {span_in_words(self, 9)}",
         ]
         if is_autonomous(self.machine, self.state):
@@ -386,7 +392,7 @@ class Orbit(Summarized):
         if listed < count:
             lines.append(f"  only {listed} of {count} impacts: find it with `impact_log={count}`")
         if self.stability != STABILITY.unknown:
-            values = [complex_in_words(m, 7, 1e-12) for m in np.asarray(self.multipliers)]
+            values = multipliers_in_words(self.multipliers, 7, 1e-12)
             lines.append(f"  multipliers: {', '.join(first_few(values))}")
         if np.isfinite(float(self.clearance)):
             room = in_unit(f"{float(self.clearance):.4g}", units, "position")
@@ -414,10 +420,18 @@ def check_multipliers(name: str, orbit: Orbit) -> None:
         )
 
 
+_ADVICE_ON_RESETS = (
+    " Events that a reset sets off at the same instant change the number of cycles (see the event "
+    "log)."
+)
+
+
 def _advice(orbit: Orbit) -> str:
-    # A choice: searches from bad starts end with residuals of some 1e-3 and more.
-    if orbit.result != ORBIT_RESULTS.no_orbit or not float(orbit.residual) < 1e-7:
+    if orbit.result != ORBIT_RESULTS.no_orbit:
         return ""
+    # A choice: searches from bad starts end with residuals of some 1e-3 and more.
+    if not float(orbit.residual) < 1e-7:
+        return _ADVICE_ON_RESETS * any(isinstance(x, Reset) for x in others_of(orbit.machine))
     return (
         " So small a residual is mostly the steps' own error: ask for a finer `method`, or for less"
         " by `root_finder=vi.Newton(tolerance=1e-8)`."
@@ -445,11 +459,19 @@ def span_in_words(orbit: Orbit, digits: int) -> str:
     return span_of_position(labels, units_of(machine), ends, digits)
 
 
-def complex_in_words(z: complex, digits: int, rounding: float) -> str:
-    """Format a complex number, or a real one if its imaginary part is rounding."""
-    if abs(z.imag) <= rounding * abs(z):
-        return f"{z.real:.{digits}g}"
-    return f"{z.real:.{digits}g}{z.imag:+.{digits}g}i"
+def multipliers_in_words(multipliers: Any, digits: int, rounding: float) -> list[str]:
+    """Format multipliers: as real numbers if the imaginary part is below `rounding`, relative to
+    the modulus, and as 0 below the rounding of their matrix."""
+    values = np.asarray(multipliers)
+    zero = _ROUNDINGS * np.finfo(values.dtype).eps * max(1.0, np.abs(values).max(initial=0.0))
+
+    def word(z: complex) -> str:
+        if abs(z) < zero:
+            return "0"
+        imaginary = f"{z.imag:+.{digits}g}i" if abs(z.imag) > rounding * abs(z) else ""
+        return f"{z.real:.{digits}g}{imaginary}"
+
+    return [word(z) for z in values]
 
 
 def trimmed(orbit: Orbit) -> Orbit:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from .._checks import count, instance_of, number, require
 from .._types import Scalar
+from ..machine import Shown
 from .linear import Matrix, solve, svd
 
 # Above this singular value a motion is so unstable that rounding hides what is neutral: a choice.
@@ -47,7 +48,7 @@ Unknowns = Float[Array, "..."]
 Residual = Callable[[Unknowns], Unknowns]
 
 
-class AbstractRootFinder(eqx.Module):
+class AbstractRootFinder(Shown):
     """An iteration towards a zero of a residual, used by `find_root`."""
 
     tolerance: eqx.AbstractVar[Any]

@@ -471,7 +471,7 @@ def _measured_rotation(
             "Argument `start` must settle on a quasi-periodic motion, but this one repeats after "
             f"{period}: find and follow that orbit."
         )
-    seen = without_angles(jnp.asarray(rows), angles_in(machine, without_modes(like)))
+    seen = without_angles(jnp.asarray(rows), sizes, angles_in(machine, without_modes(like)))
     digits = float(agreement(seen))
     if digits < _DIGITS:
         raise ValueError(

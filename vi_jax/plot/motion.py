@@ -28,6 +28,7 @@ from ..machine import (
     logged_turn,
     name_in,
     names_on,
+    near_names,
     number_on,
     stops_of,
     switches_of,
@@ -103,7 +104,7 @@ def motion_path(
             "position."
             if not isinstance(coordinate, str)
             else f"Argument `coordinate` must be a number or a component of the state, but got "
-            f"{coordinate!r}."
+            f"{coordinate!r}; {near_names(coordinate, list(components(samples.state, 1)))}."
         ) from None
     if isinstance(motion, Run) and motion.impact_log is not None and machine is not None:
         path = _with_impacts(path, motion, machine, coordinate)

@@ -5,7 +5,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, to_rgb
 from matplotlib.lines import Line2D
@@ -13,6 +12,7 @@ from matplotlib.patches import Patch
 
 from .._checks import flag, instance_of, one_of
 from .._messages import count_of
+from .._types import xr
 from ..machine import AbstractMachine, cycles_in_words, in_brackets, unit_of, units_of
 from ..scans import NOT_COMPUTED, REGIMES, Basins, IntegrityProfile
 from . import colors as look
@@ -35,7 +35,7 @@ _NAMED = 12
 
 
 def plot_regimes(
-    data: xr.Dataset,
+    data: "xr.Dataset",
     *,
     machine: AbstractMachine | None = None,
     ax: Axes | None = None,
@@ -82,7 +82,7 @@ def plot_regimes(
     return ax
 
 
-def _lanes(data: xr.Dataset) -> np.ndarray:
+def _lanes(data: "xr.Dataset") -> np.ndarray:
     """Return three numbers of each lane: its outcome; its period or regime; its impacts if they are
     distinguished, 2 for more than one. -1 means absent."""
     if "period" in data:
@@ -122,7 +122,7 @@ def _entry(
     return (0, period, impacts), name, color_of(period, None if impacts < 0 else impacts)
 
 
-def _period_namer(data: xr.Dataset) -> Callable[[int], str]:
+def _period_namer(data: "xr.Dataset") -> Callable[[int], str]:
     """Return the function that names periods in data from a machine of this class."""
     if data.attrs.get("machine_class", "Scene") != "Scene":
         return lambda cycles: count_of(cycles, "cycle")

@@ -9,7 +9,8 @@ from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
 
 from .._checks import instance_of
 from .._types import State
-from ..machine import AbstractMachine, Scene, SoftStop, convert_start
+from ..machine import AbstractMachine, SoftStop, convert_start
+from ..machines import Scene
 from .colors import BLUE, GREEN, RED
 from .motion import all_stops, new_axes
 

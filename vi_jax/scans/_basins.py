@@ -52,7 +52,7 @@ from ..machine import (
 from ..orbit import MotionSections
 from . import _geometry as geometry
 from ._scan import LanesFailed, interrupted, scan
-from .measures import CODES, REGIMES, Regime, Sections, flags
+from .measures import CODES, REGIMES, Regime, Sections, flags, legends
 from .program import START, check_leaf_name, start_with
 
 _BEYOND = REASON_NAMES.index("bad_start")
@@ -370,6 +370,7 @@ def _find_basins(
     period = data["period"]
     kind = np.min_scalar_type(-max(4, len(motions)))
     data = data.assign(label=(period.dims, label.astype(kind).reshape(period.shape), about))
+    data.attrs |= legends(data)
     return Basins(data, attractors, parts, machine)
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from .._checks import count, flag
 from .._messages import in_parts, warning_once
 from .._programs import compiled, is_outermost
-from .._types import Scalar, State, xr
+from .._types import Number, Scalar, State, xr
 from ..flow import (
     RESULTS,
     MethodLike,
@@ -64,7 +64,7 @@ class Lyapunov(Summarized):
     """Lyapunov exponents of a motion. Under `vmap` batch axes come first."""
 
     exponents: Float[Array, "... states"]
-    """The spectrum, greatest first: mean growth rates in time (`unit`; for a `Scene` ω)."""
+    """The spectrum, greatest first: growth rates per unit of time (`unit`, for a `Scene` ω)."""
     per_cycle: Float[Array, "... states"]
     """The same per drive cycle (dimensionless): ln|multipliers|/n on an orbit of n cycles. An
     autonomous machine is observed at intervals of its usual `cycle`, which count as cycles."""
@@ -99,8 +99,10 @@ class Lyapunov(Summarized):
         variables |= present(self.averages, batch)
         alone = {"spread": self.spread, "result": in_names(self.result)}
         data = xr.Dataset(variables | present(alone, batch))
-        for name in ("exponents", "spread"):
-            data[name].attrs |= attributes(self.unit)
+        names = "Lyapunov exponents", "difference of the greatest between both halves"
+        for name, words in zip(("exponents", "spread"), names, strict=True):
+            data[name].attrs |= {"long_name": f"{words}, per unit of time", **attributes(self.unit)}
+        data["per_cycle"].attrs |= {"long_name": "Lyapunov exponents", "units": "1/cycle"}
         by_name = {name: name for name in self.averages}
         return tidy(with_units(data, dict(self.units), by_name) if by_name else data, along)
 
@@ -113,7 +115,8 @@ class Lyapunov(Summarized):
         numbers = ", ".join(f"{x:.9g}" for x in self.exponents)
         ended = "" if bool(self.successful) else f"; ended: {RESULTS[self.result]}"
         numbers = with_unit(numbers, self.unit)
-        first = f"Lyapunov exponents {numbers} (halves differ by {self.spread:.1g}){ended}"
+        rate = "" if self.unit else "per unit of time, "
+        first = f"Lyapunov exponents {numbers} ({rate}halves differ by {self.spread:.1g}){ended}"
         lines = (
             f"  mean {name}: {in_unit(f'{float(x):.6g}', dict(self.units), name)}"
             for name, x in self.averages.items()
@@ -169,7 +172,7 @@ def lyapunov(
     - `rests`: as for `simulate`.
     - `progress`: show a bar for more than 1024 cycles, in a terminal or a notebook; not in `jit`.
 
-    **Returns:** a `Lyapunov`.
+    **Returns:** a `Lyapunov`, with exponents per unit of time, and per cycle in `per_cycle`.
 
     **Raises:** as `simulate`; `ValueError` for a machine with both a section and a `renewed`; on
     Ctrl-C, with more than 1024 cycles, `Interrupted`, whose `partial` are the exponents so far.
@@ -244,7 +247,7 @@ class Growth(NamedTuple):
 
 def observe_growth(
     machine: AbstractMachine, start: State, cycles: Any, *, settle: Any, method: MethodLike,
-    rests: bool | None,
+    rests: bool | None, wander: Number = 0.0,
 ) -> Growth:  # fmt: skip
     """Compute the greatest exponent as `lyapunov` does, over a number of cycles that may be traced,
     a multiple of 4; on an autonomous machine's own section, without the 0 along the motion. Sums
@@ -267,7 +270,7 @@ def observe_growth(
         weight = bump(place / (2 * half))
         lost = jnp.any(rates == -jnp.inf)  # where a weight underflows, 0 · ∞ is NaN
         rate = jnp.where(lost, -jnp.inf, rate + weight @ jnp.where(lost, 0.0, rates.ravel()))
-        seen = without_angles(rows / sizes, angles)
+        seen = without_angles(rows, sizes, angles)
         values = jnp.concatenate([seen, seen**2], axis=1)
         parts = (bump(place / half) @ values, bump(place / half - 1) @ values)
         sums = (total + values.sum(0), squares + (values**2).sum(0))
@@ -275,8 +278,8 @@ def observe_growth(
         near = jnp.minimum(near, jnp.min(jnp.linalg.norm(seen - origin, axis=1)))
         return carry, (rate, time + weight @ durations, duration + durations.sum()), sums, near
 
-    sizes = row_sizes(the_map.machine, start)  # those of angles are 1
-    origin = without_angles((carry[0][0] / sizes)[None], angles)
+    sizes = row_sizes(the_map.machine, start)
+    origin = without_angles(carry[0][0][None], sizes, angles)
     zeros = jnp.zeros(2 * origin.size, origin.dtype)
     zero = jnp.zeros((), origin.dtype)
     state = (carry, (zero, zero, zero), (zeros, zeros, zeros, zeros), zero + jnp.inf)
@@ -285,7 +288,7 @@ def observe_growth(
     mean = total / (2 * half)
     spread = jnp.sqrt(jnp.maximum(squares / (2 * half) - mean**2, 0.0))
     unit = bump((jnp.arange(_NODES) + 0.5) / _NODES).mean() * half
-    digits = digits_of((first - second) / unit, spread, mean)
+    digits = digits_of((first - second) / unit, spread, mean, wander)
     near = near / jnp.linalg.norm(spread[: origin.size])
     good = carry[-1] == RESULTS.successful
     exponent = jnp.where(good, rate / time, jnp.nan)

@@ -55,7 +55,7 @@ from ..machine import (
     with_units,
     without_modes,
 )
-from .measures import CODES, REGIMES, AbstractMeasure, Regime, Usual, flags
+from .measures import CODES, REGIMES, AbstractMeasure, Regime, Usual, flags, legends
 from .program import cycles_for, lane_noise_of, measures_of
 
 # A change is large from this many times the changes at neighbouring values, and this share of the
@@ -125,6 +125,7 @@ class Sweep(Summarized):
         variables["result"] = each, in_names(self.result)
         data = xr.Dataset(variables, {self.parameter: (each, np.asarray(self.values))})
         data["period"].attrs |= flags(CODES)
+        data.attrs |= legends(data)
         by_name = {name: name for name in (*self.averages, self.parameter)}
         return tidy(with_units(data, dict(self.units), by_name), along)
 

@@ -20,6 +20,7 @@ from .._types import Flag, Number, State
 from ..flow import AbstractMethod, Run, row_sizes
 from ..machine import (
     AbstractMachine,
+    Shown,
     angles_in,
     components,
     frequency_ratio,
@@ -71,6 +72,18 @@ CODES = {regime.name: int(regime) for regime in sorted(REGIMES)}
 def flags(codes: Mapping[str, int]) -> dict[str, Any]:
     """Return attributes of a variable with the meanings of its special numbers."""
     return {"flag_values": list(codes.values()), "flag_meanings": " ".join(codes)}
+
+
+def legends(data: Any) -> dict[str, str]:
+    """Return attributes of a data set with these meanings, as prints of it show no others."""
+    found = {}
+    for name, x in data.data_vars.items():
+        codes = zip(
+            x.attrs.get("flag_values", ()), x.attrs.get("flag_meanings", "").split(), strict=True
+        )
+        words = [f"{value} {meaning}" for value, meaning in sorted(codes, key=lambda c: abs(c[0]))]
+        found |= {f"{name}_codes": ", ".join(words)} if words else {}
+    return found
 
 
 def least_period(
@@ -134,7 +147,7 @@ def _dtype(run: Run) -> Any:
     return jtu.tree_leaves(run.sections)[0].dtype
 
 
-class AbstractMeasure(eqx.Module):
+class AbstractMeasure(Shown):
     """A measure: a function of the observed cycles of each lane, computed before the next lanes."""
 
     attributes: ClassVar[About] = {}
@@ -312,12 +325,17 @@ class Sections(AbstractMeasure):
 
 
 class Exponent(AbstractMeasure):
-    """`exponent`, the greatest Lyapunov exponent, over `observed` further drive cycles."""
+    """`exponent`, the greatest Lyapunov exponent per unit of time, over `observed` further drive
+    cycles."""
 
     observed: int = eqx.field(static=True, default=128)
     record = "sections"
     attributes: ClassVar[About] = {
-        "exponent": {"unit_of": "rate", "long_name": "greatest Lyapunov exponent"}
+        "exponent": {
+            "unit_of": "rate",
+            "long_name": "greatest Lyapunov exponent",
+            "comment": "per unit of time",
+        }
     }
 
     def __check_init__(self):
@@ -345,27 +363,42 @@ class Rotation(AbstractMeasure):
     both ends. Over 1,024 cycles they agree to five digits and more on most quasi-periodic motions
     and to less than four on chaotic ones; the error of the rotation number is then some 1e-9. The
     number is that of turns around the mean of the sections, from 0 to 1/2, as ρ and 1 - ρ are the
-    same curve. It is NaN for a fixed point and has no meaning on chaotic motions. A motion that
-    slowly settles on a periodic one has many digits: `Regime` examines its exponent too.
+    same curve. It is NaN for a fixed point, and where averages agree to less than 3.5 digits, as on
+    chaotic motions. A motion that slowly settles on a periodic one has many digits: `Regime`
+    examines its exponent too. Components that stand still, to the accuracy of the method, do not
+    count.
 
     **Arguments:** `cycles`, the number of observed cycles; static.
     """
 
     cycles: int = eqx.field(static=True, default=1024)  # pyright: ignore
+    wander: Any = eqx.field(default=0.0, kw_only=True)
+    """The error of sections under the method; set by a scan."""
     record = "sections"
     attributes: ClassVar[About] = {
-        "rotation": {"units": "turn/cycle", "long_name": "rotation number"},
+        "rotation": {
+            "units": "turn/cycle",
+            "long_name": "rotation number",
+            "comment": f"NaN for a fixed point, and with less than {_FEW} digits",
+        },
         "digits": {"units": "1", "long_name": "digits to which averages of both halves agree"},
     }
 
     def __check_init__(self):
         count("cycles", self.cycles, least=16)
 
+    def under(self, method):
+        """Return this measure with the error of sections under this method."""
+        return dataclasses.replace(self, wander=method.wander)
+
     def __call__(self, machine, run):
         first = jtu.tree_map(lambda x: x[0], run.sections)
         rows = in_rows(run.sections)[-self.cycles :]
-        rows = without_angles(rows, angles_in(machine, first))
-        return {"rotation": rotation_number(rows), "digits": agreement(rows)}
+        sizes = row_sizes(machine, first, rows)
+        rows = without_angles(rows, sizes, angles_in(machine, first))
+        digits = agreement(rows, self.wander)
+        turns = rotation_number(rows, self.wander)
+        return {"rotation": jnp.where(digits < _FEW, jnp.nan, turns), "digits": digits}
 
 
 class Regime(AbstractMeasure):
@@ -473,7 +506,9 @@ class Regime(AbstractMeasure):
         is_last, again = self._is_last(pass_number), jnp.asarray(pass_number) > 0
         observed = jnp.where(is_last, self.averaged // 4 * 4, self.observed)
         settle = jnp.where(again & ~is_last, self.observed + self.lasting, 0)
-        seen = observe_growth(machine, state, observed, settle=settle, method=method, rests=rests)
+        seen = observe_growth(
+            machine, state, observed, settle=settle, method=method, rests=rests, wander=self.wander
+        )
         # A lane that cannot be continued is unchanged.
         otherwise = jnp.where(seen.successful & again, REGIMES.transient, before)
         chaos = jnp.where(seen.exponent > self.threshold, REGIMES.chaotic, otherwise)

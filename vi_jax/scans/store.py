@@ -27,7 +27,7 @@ from .._messages import installed_version, warn
 from .._types import xr, zarr
 from ..flow import REASON_NAMES
 from ..machine import attributes, leaf, leaf_names, outcomes_of, unit_of, units_of
-from .measures import flags
+from .measures import flags, legends
 from .program import LANE, NOISE, START, Blocks, ScanProgram, part_of
 
 try:
@@ -93,7 +93,8 @@ class MemoryStore:
             known = name.startswith(START) or self.program.build is None
             if known and part_of(name) != NOISE:
                 data[name].attrs |= attributes(unit_of(units_of(machine), name))
-        data.attrs = {"vi_jax": installed_version(), "machine_class": type(machine).__name__}
+        data.attrs = legends(data)
+        data.attrs |= {"vi_jax": installed_version(), "machine_class": type(machine).__name__}
         data.attrs |= {x: self.about[x] for x in ("method", "settle", "cycles", "precision")}
         tables = [name for name in ("machine", "start", "noise") if name in self.about]
         data.attrs |= {name: json.dumps(self.about[name]) for name in tables}

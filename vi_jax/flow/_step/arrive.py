@@ -598,6 +598,11 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
     lane = lane._replace(direction=tuple(direction), modes=modes)
     if lane.contact is None or len(impacts) == 1:
         return lane
+    rested = () if lane.record.events is None else before.contact or ()
+    for k in limited_in(machine) if rested else ():  # an impact on another stop lifts a body
+        old, clock = rested[k], plan.clock(lane.s, lane.state)
+        lifted = step.taken & met & (old > 0) & (contact[k] == 0)
+        lane = lane.log_event(lifted, clock, EventKind.release, old - to_event(0), jnp.nan)
     # It may release bodies on other stops. A stop may have changed the modes already.
     return release_pulled(plan, lane, step.taken, met, (at_event, before.modes), before.contact)
 

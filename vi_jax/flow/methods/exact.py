@@ -16,22 +16,24 @@ from ..._checks import count
 from ..._types import Flag, Scalar, Scalars, State
 from ...machine import (
     AbstractMachine,
-    CosineCrank,
-    IdealDrive,
-    LinearMachine,
-    ModalMachine,
-    OscillatorState,
     Prepared,
-    Scene,
     forces,
     horner,
     limited_in,
-    modal,
     overridden,
     phase_at,
     sincos,
     stops_of,
     switches_of,
+)
+from ...machines import (
+    CosineCrank,
+    IdealDrive,
+    LinearMachine,
+    ModalMachine,
+    OscillatorState,
+    Scene,
+    modal,
 )
 from ..smooth import Integrals, SmoothMachine, constant, rate_of_integrals
 from .base import AbstractMethod

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, Range, on_host, real, require_ranges
 from .._types import State
 from ..lanes import sincos
-from .numbers import Shown
+from ..machine import Shown
 
 # The units of the paper's scene, by the names of quantities, components and parameters.
 UNITS: Mapping[str, str] = MappingProxyType({

@@ -7,7 +7,6 @@ separate equations for the modes, but for the off-diagonal part of c.
 """
 
 import abc
-from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -19,10 +18,17 @@ from jaxtyping import Array, Float
 
 from .._checks import concrete, number
 from .._types import Flag, Number, Scalar, Scalars, State
-from .base import AbstractMachine, Coordinate
-from .declared import overridden
-from .numbers import Shown
-from .stop import RigidStop
+from ..machine import (
+    AbstractMachine,
+    Coordinate,
+    Prepared,
+    RigidStop,
+    Shown,
+    convert_start,
+    in_cycle_state,
+    overridden,
+    prepared,
+)
 
 Numbers = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
@@ -161,14 +167,6 @@ def times(matrix: Any, x: Numbers) -> Numbers:
 def solved(matrix: Any, x: Numbers) -> Numbers:
     """Solve a linear system with a matrix, or the diagonal of one."""
     return x / matrix if matrix.ndim == 1 else jnp.linalg.solve(matrix, x)
-
-
-class Prepared(NamedTuple):
-    """A machine in the form for a run, and the conversions of its states to that form and back."""
-
-    machine: Any
-    inward: Callable[[State], State] = lambda state: state
-    outward: Callable[[State], State] = lambda state: state
 
 
 class _Basis(NamedTuple):
@@ -479,3 +477,9 @@ class LinearMachine(AbstractMachine):
         inverse = None if self.mass.ndim == 1 else jnp.linalg.inv(self.mass)
         known = _Known(inverse, longest)
         return eqx.tree_at(lambda m: m._known, self, known, is_leaf=lambda x: x is None)
+
+
+# The defaults for other machines are in `machine.clocks`.
+convert_start.register(LinearMachine, LinearMachine.convert_start)
+in_cycle_state.register(LinearMachine, LinearMachine.in_cycle_state)
+prepared.register(LinearMachine, LinearMachine.prepared)

@@ -35,8 +35,32 @@ from .._checks import (
 )
 from .._messages import warn
 from .._types import Number, Scalar, State
-from .base import AbstractMachine
-from .declared import overridden
+from ..machine import (
+    AbstractMachine,
+    RigidStop,
+    Shown,
+    SoftStop,
+    as_logged,
+    at_section,
+    clock_in_words,
+    clock_word,
+    convert_start,
+    cycle_time,
+    cycles_in_words,
+    frequency_ratio,
+    in_clock,
+    in_cycle_clock,
+    in_cycle_state,
+    is_alive,
+    known,
+    like,
+    logged_turn,
+    may_rest,
+    overridden,
+    phase_at,
+    scales_known,
+)
+from ..machine import State as Named
 from .drives import (
     UNITS,
     AbstractCrank,
@@ -47,10 +71,6 @@ from .drives import (
     OscillatorState,
     SliderCrank,
 )
-from .numbers import Shown, known
-from .state import State as Named
-from .state import like
-from .stop import RigidStop, SoftStop
 
 # The largest error of a state on the section. In single precision, that of a turn is 5e-7.
 _ON_SECTION = 1e-5
@@ -420,6 +440,34 @@ _LONG = 1000.0
 
 # A plain number, or an array of them to `vmap` over.
 _Plain = Float[Array, "..."] | float
+
+
+def _clock_in_words(scene: Scene, since_section: float, cycles: int) -> str:
+    angle = float(scene.phase_at(since_section))
+    return f"{clock_word(scene)} {angle:.6g} of {cycles_in_words(scene, cycles)}"
+
+
+def _scales_known(scene: Scene) -> bool:
+    return not scene.soft_stops and jax.eval_shape(scene.drive.rate) is not None
+
+
+# The defaults for other machines are in `machine.clocks`.
+in_clock.register(Scene, Scene.in_clock)
+in_cycle_clock.register(Scene, lambda scene: scene.in_clock("phase"))
+at_section.register(Scene, Scene.at_section)
+phase_at.register(Scene, Scene.phase_at)
+convert_start.register(Scene, Scene.convert_start)
+in_cycle_state.register(Scene, Scene.in_cycle_state)
+cycle_time.register(Scene, lambda scene: scene.period)
+logged_turn.register(Scene, lambda scene: 2 * pi)
+as_logged.register(Scene, Scene.as_logged)
+frequency_ratio.register(Scene, Scene.frequency_ratio)
+cycles_in_words.register(Scene, lambda scene, cycles: f"{2 * cycles}π")
+clock_word.register(Scene, lambda scene: "crank angle φ =")
+clock_in_words.register(Scene, _clock_in_words)
+scales_known.register(Scene, _scales_known)
+is_alive.register(Scene, Scene.alive)
+may_rest.register(Scene, Scene.may_rest)
 
 
 def _si(name: str, unit: str, default: float | None, allowed: Range = REAL) -> Any:
