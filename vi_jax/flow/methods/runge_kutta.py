@@ -1,6 +1,5 @@
 """Methods with steps of a diffrax Runge–Kutta solver, sized by their error or of fixed number."""
 
-import functools
 import sys
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
