@@ -398,3 +398,40 @@ def test_friction_on_a_stop_does_not_hold_for_ever():
     released = np.array([p[k == int(EventKind.release)] for p, k in zip(phase, kind, strict=True)])
     leaves = 2 * (np.pi - np.arcsin(0.3 + levels))
     np.testing.assert_allclose(released[:, 0], leaves, rtol=1e-9)
+
+
+class Sheltered(vi.AbstractMachine):
+    """Friction beside a stop; the velocity has a unit of its own."""
+
+    speed: Any
+    drive: Any
+    cycle = 5 * np.pi
+
+    @property
+    def contacts(self):
+        rubs = vi.DryFriction(0.4 * self.speed, on="u")
+        return rubs, vi.RigidStop(0.9, 0.6, on=("x", "u"))
+
+    def field(self, s, z):
+        push = self.drive * jnp.cos(0.4 * s) - z.x
+        return {"x": z.u / self.speed, "u": self.speed * push}
+
+
+def test_friction_beside_a_stop_in_single_precision():
+    """Regression: no body was released any more, and with a velocity in large units steps ended."""
+    drives, units = (x.ravel() for x in np.meshgrid(np.linspace(0.9, 1.3, 8), (1.0, 1e6, 1e-6)))
+
+    def last():
+        def lane(drive, unit):
+            start = vi.State(x=0.1 + 0 * drive, u=0.2 * unit)
+            run = vi.simulate(Sheltered(unit, drive), start, 3, event_log=12)
+            return run.last.x, run.event_log.kind[-1]
+
+        return jax.vmap(lane)(jnp.asarray(drives, float), jnp.asarray(units, float))
+
+    (places, kinds), slips = last(), int(EventKind.mode)
+    with jax.enable_x64(False):
+        single, kinds_too = last()
+    np.testing.assert_allclose(single, places, rtol=0, atol=2e-5)
+    assert np.all((np.asarray(kinds) == slips).sum(axis=1) >= 2)
+    np.testing.assert_array_equal(kinds, kinds_too)

@@ -34,7 +34,7 @@ from .machine_checks import (
 from .noise import in_modes_of
 from .plan import Plan
 from .results import code
-from .sizes import at_most_one, extents_of, sizes_of
+from .sizes import extents_of, limited_size, sizes_of
 
 
 def _is_active(plan: Plan, lane: Lane) -> Flag:
@@ -82,7 +82,7 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     sizes = sizes_of(plan.machine, s, start, modes)
     if sizes is not None:
         extents = extents_of(plan, s, start, modes, sizes)
-        sizes = jtu.tree_map(at_most_one, sizes)
+        sizes = jtu.tree_map(limited_size, sizes)
         method = plan.method.with_sizes(sizes)
         plan = dataclasses.replace(plan, method=method, sizes=sizes, extents=extents)
         if plan.memory is not None:

@@ -104,10 +104,10 @@ class Plan(eqx.Module):
     memory: Any = None
 
     sizes: State | None = None
-    """The size of each number of the state (see `sizes.sizes_of`), at most 1."""
+    """The size of each number of the state (see `sizes.sizes_of` and `limited_size`)."""
     extents: tuple[Any, ...] | None = None
-    """The size, at most 1, of each coordinate, then that of the guard of each of `others`; `None`
-    for a machine whose numbers are about 1. An event that holds a mode has a pair of sizes, out of
+    """The `limited_size` of each coordinate, then that of the guard of each of `others`; `None` for
+    a machine whose numbers are about 1. An event that holds a mode has a pair of sizes, out of
     mode 0 and in it, since its guard is another quantity there."""
 
     def extent(self, k: int) -> Scalar | float:

@@ -165,7 +165,7 @@ def _with_slip(
 def extents_of(
     plan: "Plan", s: Scalar, start: State, modes: Scalars, sizes: State
 ) -> tuple[Any, ...]:
-    """Return `Plan.extents`: the size, at most 1, of each coordinate, then the size of the guard of
+    """Return `Plan.extents`: the `limited_size` of each coordinate, then the size of the guard of
     each event other than a stop. `sizes` are from `sizes_of`."""
     machine, unit = plan.machine, plan.unit
     contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates) if plan.rests else ()
@@ -180,7 +180,7 @@ def extents_of(
         return _known_or_one(jnp.maximum(size, size_of(lambda x: guard(s, x), start, sizes)))
 
     of_coordinates = (size_of(x.position, start, sizes) for x in machine.coordinates)
-    extents: list[Any] = [at_most_one(_known_or_one(size)) for size in of_coordinates]
+    extents: list[Any] = [limited_size(_known_or_one(size)) for size in of_coordinates]
     for number in plan.others(start):
         event, rest = events_of(machine)[number], contact
         if not event.holds_mode:
@@ -200,9 +200,11 @@ def _known_or_one(size: Array) -> Array:
     return jnp.where(size > 0, size, 1.0)
 
 
-def at_most_one(size: Array) -> Array:
-    """Return a size; 1 if it is larger, since the motion may become smaller."""
-    return jnp.minimum(size, 1.0)
+def limited_size(size: Array) -> Array:
+    """Return a size; 1 if it is larger, since the motion may become smaller. It is not below a
+    large number of roundings of the size (a choice), which in single precision is the size."""
+    rounding = min(1.0, 2.0**23 * float(jnp.finfo(size.dtype).eps))
+    return jnp.minimum(size, jnp.maximum(rounding * size, 1.0))
 
 
 def rounding_bounds(

@@ -19,7 +19,7 @@ from .._checks import one_of
 from .._types import Machine, Scalar, Scalars, State
 from .contacts import call_checked, field_in, impact_on, rate_of, shown_modes
 from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
-from .friction import frictions_in, settled_modes
+from .friction import Friction, frictions_in, settled_modes
 from .leaves import size_of
 from .modes import constant_modes, modes_after, modes_at_start
 from .overrides import with_static
@@ -85,6 +85,8 @@ def after_event(
     new = _with_friction(machine, number, s, state, new)
     if alone and event.holds_mode and part.start in frictions_in(machine):
         released = {part.start: jnp.asarray(modes[part.start] == 0)}
+        # Its slip is zero now, to the rounding of a surface's speed.
+        changed = (*changed[: part.start], jnp.zeros_like(s), *changed[part.stop :])
         changed = settled_modes(machine, s, new, constant_modes(changed, s), contact, released)
     return new, constant_modes(changed, s)
 
@@ -147,7 +149,8 @@ def struck_modes(
     contact: Scalars = (), before: State | None = None, released: dict[int, Any] | None = None,
 ) -> Modes:  # fmt: skip
     """Return the modes after a jump to `state`, from `before` if that is known; the machine's own
-    are unchanged, or `own`. `released` as in `settled_modes`."""
+    are unchanged, or `own`. `released` as in `settled_modes`. A body that sticks, and whose slip
+    the jump does not change, sticks on: its slip is an error of the method."""
     event_modes = []
     for number, event in enumerate(events_of(machine)):
         if event.holds_mode:
@@ -157,10 +160,14 @@ def struck_modes(
                 # On its surface, where the sign is rounding, only its own event changes the mode.
                 was, now = (event.function(machine, s, x) for x in (before, state))
                 mode = jnp.where(stop_gradient(was == now), modes[part][0], mode)
+            if before is not None and isinstance(event, Friction):
+                sticks = (jnp.abs(modes[part][0]) < 1) & ~event.changes(machine, s, before, state)
+                mode = jnp.where(sticks, 0.0, mode)
             event_modes.append(mode)
     machine_modes = modes[len(event_modes) :] if own is None else own
     modes = constant_modes([*event_modes, *machine_modes], s)
     if frictions_in(machine):
+        released = {} if released is None and before is not None else released
         modes = constant_modes(settled_modes(machine, s, state, modes, contact, released), s)
     return modes
 

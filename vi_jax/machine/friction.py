@@ -41,7 +41,7 @@ from .event import AbstractSwitch, EventContext
 from .leaves import size_of
 from .overrides import hashable
 from .parts import at_stop, limited_in, stops_of, switches_of
-from .settle import Contacts, Settled, settle
+from .settle import Contacts, Settled, released_share, settle
 from .state import with_components
 
 
@@ -103,6 +103,14 @@ class Friction(AbstractSwitch):
             size = size + jnp.asarray(machine.cycle) / (2 * pi) * rate
         least = stop_gradient(self.roundings * float(jnp.finfo(slip.dtype).eps) * size)
         return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
+
+    def changes(self, machine: Machine, s: Scalar, before: State, after: State) -> Flag:
+        """Return whether a jump changes the slip, by more than rounding."""
+        slips = [stop_gradient(self.speed_of_slip(machine, s, x)) for x in (before, after)]
+        sizes = jtu.tree_map(jnp.abs, stop_gradient(before))
+        size = size_of(lambda x: self.speed_of_slip(machine, s, x), before, sizes)
+        least = self.roundings * float(jnp.finfo(size.dtype).eps) * (size + jnp.abs(slips[1]))
+        return jnp.abs(slips[1] - slips[0]) > least
 
     def begin(self, machine, s, state):
         """Return the direction of slip: `settled_modes` decides which bodies stick."""
@@ -399,11 +407,6 @@ def _argument_count(function: Callable[..., Any]) -> int:
     return min(max(count, 1), 3)
 
 
-# A body that a force sets in motion does not stick again at once: at this event its force equals
-# the largest one to the accuracy of the event, which this share exceeds. A choice.
-_RELEASED = 1e-6
-
-
 def settled_modes(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
     released: dict[int, Flag] | None = None,
@@ -450,7 +453,7 @@ def _slips(
         slip = friction.slip_sign(machine, s, state, flow)
         if begins is not None:  # the slip of a sticking body is rounding
             slip = jnp.where(jnp.abs(modes[i]) < 1, 0.0, slip)
-            ratio = jnp.where(begins[n], 1 - _RELEASED, ratio)
+            ratio = jnp.where(begins[n], 1 - released_share(slip), ratio)
         slips.append(slip)
         holds.append(ratio + jnp.zeros_like(s))
     return tuple(slips), tuple(holds)

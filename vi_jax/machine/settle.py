@@ -28,12 +28,30 @@ SOLVED, UNSOLVED, WORKING = 0.0, 1.0, 2.0
 # ended in rays that do not exist.
 _TIES = 4096.0
 
+# Shares below are relative to numbers that are known to at most this many roundings: a choice.
+_ROUNDINGS = 64.0
+
 # A closed contact opens if its rate exceeds this share of the rates' size: a redundant one is not
 # pushed, but stays closed. Far above rounding, far below rates that open a contact.
 _OPENS = 1e-9
 
+# A body that a force sets in motion does not stick again at once: at this event its force equals
+# the largest one to the accuracy of the event, which this share exceeds. A choice.
+_RELEASED = 1e-6
+
 # An impact gains energy if it gains more than this share of its work: some roundings.
 _GAIN = 1e-12
+
+
+def _share(share: float, x: Array) -> float:
+    """Return a threshold, at least some roundings in the precision of `x`."""
+    return max(share, _ROUNDINGS * float(jnp.finfo(x.dtype).eps))
+
+
+def released_share(x: Array) -> float:
+    """Return the share by which a force that has become too large exceeds friction at least, above
+    ties in the precision of `x`."""
+    return max(_RELEASED, 64 * _TIES * float(jnp.finfo(x.dtype).eps))
 
 
 class Contacts(NamedTuple):
@@ -79,7 +97,7 @@ def lemke(matrix: Array, constant: Array) -> tuple[Array, Array, Array]:
     m, dtype = constant.shape[0], constant.dtype
     rows, columns = np.arange(m), np.arange(2 * m + 2)
     eps = float(jnp.finfo(dtype).eps)
-    size = jnp.maximum(jnp.max(jnp.abs(matrix)), 1e-300)
+    size = jnp.maximum(jnp.max(jnp.abs(matrix)), float(jnp.finfo(dtype).tiny))
     least, tie = _TIES * eps, _TIES * eps * (1 + jnp.max(jnp.abs(constant)))
     # Columns: w, z, the artificial variable, the right side.
     parts = np.eye(m), -matrix, -np.ones((m, 1)), constant[:, None]
@@ -162,7 +180,7 @@ def _scaled(x: Contacts) -> tuple[Contacts, Array, Array]:
     n, t = x.closed.shape[0], x.friction.shape[0]
     own = jnp.sum(x.gains * np.eye(x.rates.shape[0]), 1)
     unit = 1 / jnp.sqrt(jnp.where(own > 0, own, 1.0))
-    top = jnp.maximum(jnp.max(jnp.abs(x.rates * unit)), 1e-300)
+    top = jnp.maximum(jnp.max(jnp.abs(x.rates * unit)), float(jnp.finfo(unit.dtype).tiny))
     if x.level.shape[0]:
         top = jnp.maximum(top, jnp.max(jnp.abs(x.level / unit[n + t :])))
     scaled = x._replace(
@@ -261,7 +279,7 @@ def _redundant(gains: Array, pushes: Array, holds: Array, still: Array) -> Array
     `still`."""
     gains, rows = stop_gradient(gains), np.arange(gains.shape[0])
     own = jnp.sum(gains * np.eye(len(rows)), 1)
-    zeros = jnp.zeros((len(rows),), gains.dtype)
+    zeros, least = jnp.zeros((len(rows),), gains.dtype), _share(_REDUNDANT, gains) * own
     first = jnp.concatenate([pushes, holds])
     takes = jnp.stack([first, jnp.concatenate([pushes & False, still])])
 
@@ -271,7 +289,7 @@ def _redundant(gains: Array, pushes: Array, holds: Array, still: Array) -> Array
         here = rows == row
         column = jnp.sum(jnp.where(here, table, 0.0), 1)
         pivot = jnp.sum(jnp.where(here, column, 0.0))
-        counts = here & takes & (pivot > _REDUNDANT * own)
+        counts = here & takes & (pivot > least)
         any_counts = jnp.any(counts)
         change = column[:, None] * jnp.sum(jnp.where(here[:, None], table, 0.0), 0)
         change = change / jnp.where(any_counts, pivot, 1.0)
@@ -279,7 +297,7 @@ def _redundant(gains: Array, pushes: Array, holds: Array, still: Array) -> Array
 
     order = np.tile(rows, 2) * 1.0, jnp.repeat(takes, len(rows), 0)
     (table, found), _ = jax.lax.scan(step, (gains, zeros), order)
-    return (found == 0) & (jnp.sum(table * np.eye(len(rows)), 1) <= _REDUNDANT * own)
+    return (found == 0) & (jnp.sum(table * np.eye(len(rows)), 1) <= least)
 
 
 def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) -> Settled:
@@ -296,7 +314,7 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
     pushed = x.gains @ found.force
     rate = pushed + x.rates
     size = jnp.max(jnp.abs(x.rates)) + jnp.max(jnp.abs(pushed))
-    moves = jnp.where(jnp.abs(rate) > _OPENS * size, jnp.sign(rate), 0.0)
+    moves = jnp.where(jnp.abs(rate) > _share(_OPENS, rate) * size, jnp.sign(rate), 0.0)
     still = ~found.holds & (x.slip == 0) & (moves[n:] == 0)
     # A slip without a force goes where it is accelerated.
     mode = jnp.where(~found.holds & (found.mode == 0), moves[n:], found.mode)
@@ -309,12 +327,23 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
 
 
 def _decide_with_ratios(x: Contacts, of: tuple[int, ...]) -> _Decided:
+    """Frictions begin to slip one by one, the fastest first: the less force of one may hold the
+    others. One that would then be accelerated against its slip is asked anew."""
+    n, rows = x.closed.shape[0], np.arange(x.slip.shape[0])
+    own = jnp.sum(x.gains * np.eye(x.rates.shape[0]), 1)[n:]
+
     def ask(state: tuple) -> tuple:
         slip, _, _, count = state
         new = _decide(x._replace(slip=slip), of)
-        begins = (new.mode != slip) & (x.hold != 1) & (new.code == SOLVED)
-        again = jnp.any(begins) & (count < slip.shape[0])
-        return jnp.where(begins, new.mode, slip), new, jnp.where(again, 1.0, 0.0), count + 1.0
+        pushed = x.gains @ new.force
+        size, rate = jnp.max(jnp.abs(x.rates)) + jnp.max(jnp.abs(pushed)), (pushed + x.rates)[n:]
+        returns = (slip != x.slip) & (rate * slip < -2 * released_share(rate) * size)
+        begins = (new.mode != slip) & (x.hold != 1) & (new.code == SOLVED) & ~jnp.any(returns)
+        pace = jnp.where(begins, rate * rate / jnp.where(own > 0, own, 1.0), -1.0)
+        first = begins & (rows == jnp.min(jnp.where(pace == jnp.max(pace), rows, len(rows))))
+        again = jnp.any(begins | returns) & (count < 3 * slip.shape[0])
+        slip = jnp.where(returns, x.slip, jnp.where(first, new.mode, slip))
+        return slip, new, jnp.where(again, 1.0, 0.0), count + 1.0
 
     shapes, zero = jax.eval_shape(lambda: _decide(x, of)), jnp.zeros((), x.rates.dtype)
     nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), shapes)
@@ -438,7 +467,7 @@ def _without_gain(x: Strike, inelastic: Array, full: Array, code: Array) -> Blow
     c1 = jnp.dot(change, x.velocity + x.gains @ inelastic)
     c2 = 0.5 * jnp.dot(change, x.gains @ change)
     size = jnp.abs(jnp.dot(inelastic, x.velocity)) + jnp.abs(jnp.dot(full, x.velocity))
-    gains = stop_gradient(c0 + c1 + c2) > _GAIN * stop_gradient(size)
+    gains = stop_gradient(c0 + c1 + c2) > _share(_GAIN, size) * stop_gradient(size)
     root = jnp.sqrt(jnp.where(gains, jnp.maximum(c1 * c1 - 4 * c0 * c2, 0.0), 1.0))
     stable = -2 * c0 / jnp.where(gains & (c1 > 0), c1 + root, 1.0)
     other = (root - c1) / jnp.where(gains, 2 * c2, 1.0)

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from .._types import Scalar, State
 from ..flow import Rates, guard_rates
@@ -111,8 +112,7 @@ def _touching_part(problem: Shooting, at: Step) -> Change | None:
     if not mode:  # to rounding it may still be held there
         return Change(number, place, (0.0, next_mode or 1.0, 0.0), False)
     # A surface holds a motion that touches it only if the field of the other side points to it.
-    is_held = excess < LOCATED * nearest.unit / problem.radian
-    return Change(number, place, (mode, 0.0, mode), False) if is_held else None
+    return Change(number, place, (mode, 0.0, mode), False) if excess < LOCATED else None
 
 
 def _change_at_event(problem: Shooting, at: Step) -> Change | None:
@@ -124,8 +124,7 @@ def _change_at_event(problem: Shooting, at: Step) -> Change | None:
         before, after = (_mode(problem, leg, event.number) for leg in (i - 1, i))
         if before:
             excess, rate, _ = excess_force(problem, at, i, event.number, float(clock[i]))
-            share = abs(excess) / at.observed.units[i]
-            found.append((share, rate, event.number, float(clock[i]), before, after))
+            found.append((abs(excess), rate, event.number, float(clock[i]), before, after))
     if not found:
         return None
     share, rate, number, place, before, after = min(found)
@@ -140,15 +139,20 @@ def excess_rates(
     problem: Shooting, machine: AbstractMachine, leg: Leg, number: int, s: Scalar, state: State
 ) -> Rates:
     """Return how far the driving force of a switch exceeds the holding force, with its rates."""
+    held = _held(problem, machine, leg, number)
+
+    def guard(s, state):
+        return guard_of(machine, number, s, state, held.modes, held.contact)
+
+    return guard_rates(held.smooth.field, guard, s, state)
+
+
+def _held(problem: Shooting, machine: AbstractMachine, leg: Leg, number: int) -> Flight:
+    """Return the flight of a leg with a switch that holds the motion on its surface."""
     j, modes = mode_number(machine, number), problem.modes_in(leg)
     modes = (*modes[:j], jnp.zeros_like(modes[j]), *modes[j + 1 :])
     contact = problem.flight(machine, leg).contact
-    held = Flight(machine, modes, problem.method, problem.like, contact)
-
-    def guard(s, state):
-        return guard_of(machine, number, s, state, modes, contact)
-
-    return guard_rates(held.smooth.field, guard, s, state)
+    return Flight(machine, modes, problem.method, problem.like, contact)
 
 
 @on_host
@@ -157,15 +161,17 @@ def _excess_at(problem: Shooting, x, leg, number: int, s, at_event: bool):
     # At an event the state just before it; otherwise the leg is integrated.
     state = problem.unravel(states[leg]) if at_event else problem.state_at(x, leg, s)
     excess, modes = excess_rates(problem, machine, leg, number, s, state), problem.modes_in(leg)
-    contact = problem.flight(machine, leg).contact
-    new = after_event(machine, number, s, state, modes, contact)[1]
-    return excess.x, excess.v, new[mode_number(machine, number)]
+    held, u = _held(problem, machine, leg, number), ravel_pytree(state)[0]
+    size = problem.guard_sizes(held, jnp.asarray(s, u.dtype), u)[number]
+    new = after_event(machine, number, s, state, modes, held.contact)[1]
+    return excess.x / size, excess.v / size, new[mode_number(machine, number)]
 
 
 def excess_force(
     problem: Shooting, at: Step, leg: int, number: int, s: float
 ) -> tuple[float, float, float]:
-    """Return the excess force off a switch's surface, its rate, and the switch's next mode."""
+    """Return the excess force off a switch's surface and its rate, as shares of the size of such a
+    force, and the switch's next mode."""
     at_event = bool(s == problem.values(at.x)[0][leg])
     excess, rate, mode = _excess_at(problem, at.x, np.asarray(leg), number, s, at_event)
     return float(excess), float(rate), float(mode)

@@ -108,11 +108,11 @@ def least_period(
     **Arguments:** `sections`, more than `longest`; `exact`, numbers that repeat exactly, the
     impacts of the cycle before each section and the machine's own modes there; `tolerance`,
     relative to `sizes` (`row_sizes`) + |state|, by default the larger of 1e-6 and ten times
-    `wander`, the error of sections under their method; `angles`, True for angles.
+    `wander`, the error of sections under their method, or rounding; `angles`, True for angles.
     """
     states = in_rows(sections).T
-    if tolerance is None:
-        tolerance = jnp.maximum(_TOLERANCE, _WANDERS * jnp.asarray(wander, states.dtype))
+    noise = _noise(wander, states.dtype)
+    tolerance = jnp.maximum(_TOLERANCE, _WANDERS * noise) if tolerance is None else tolerance
     rows, size = jnp.concatenate([states, exact.astype(states.dtype)]), len(states)
     count = states.shape[1] - longest
     last = rows[:, longest:]
@@ -129,10 +129,14 @@ def least_period(
     periods = jnp.arange(1, longest + 1, dtype=jnp.int32)
     _, difference = jax.lax.scan(compared, None, periods)
     least = jnp.min(difference)
-    noise = jnp.maximum(wander, _ROUNDINGS * float(jnp.finfo(states.dtype).eps))
     most = jnp.minimum(_SLACK * tolerance, _WORSE * jnp.maximum(least, noise))
     period = jnp.min(jnp.where(difference <= most, periods, longest))
     return jnp.where(least <= tolerance, period, REGIMES.unsettled)
+
+
+def _noise(wander: Number, dtype: Any) -> Array:
+    """Return the error of sections by their method (`wander`) and by rounding."""
+    return jnp.maximum(jnp.asarray(wander, dtype), _ROUNDINGS * float(jnp.finfo(dtype).eps))
 
 
 Numbers = dict[str, Array]
@@ -403,12 +407,12 @@ class Regime(AbstractMeasure):
     A motion has the least period p ≤ `longest` after which its sections repeat within `tolerance`,
     with as many impacts in each cycle. The tolerance is relative to the size of each component,
     which is 1 for the paper's scenes; by default it is 1e-6, or ten tolerances of a method with
-    adaptive steps. See `least_period` for a motion that still spirals in. Other motions are
-    observed for another `observed` cycles. If the greatest Lyapunov exponent exceeds `threshold`
-    there (in the machine's unit of rates), the motion goes on for `lasting` cycles and is observed
-    once more. It is chaotic if its exponent exceeds `threshold` again. Otherwise it is transiently
-    chaotic: it has settled meanwhile, or is about to. `REGIMES` has the numbers for these kinds in
-    `period`.
+    adaptive steps (8e-5 in single precision). See `least_period` for a motion that still spirals
+    in. Other motions are observed for another `observed` cycles. If the greatest Lyapunov exponent
+    exceeds `threshold` there (in the machine's unit of rates), the motion goes on for `lasting`
+    cycles and is observed once more. It is chaotic if its exponent exceeds `threshold` again.
+    Otherwise it is transiently chaotic: it has settled meanwhile, or is about to. `REGIMES` has the
+    numbers for these kinds in `period`.
 
     The others are observed for another `averaged` cycles. They are quasi-periodic if averages over
     both halves agree to many digits (see `Rotation`), the exponent is zero to the accuracy of that
@@ -513,7 +517,8 @@ class Regime(AbstractMeasure):
         is_weak = again & bool(self.averaged) & (chaos == REGIMES.chaotic) & (growth < _GROWS)
         chaos = jnp.where(is_weak, REGIMES.unsettled, chaos)
         # A motion without losses that repeats after many cycles has digits and no growth, too.
-        moves_on = seen.nearest > jnp.maximum(_TOLERANCE, _WANDERS * self.wander)
+        noise = _noise(self.wander, seen.nearest.dtype)
+        moves_on = seen.nearest > jnp.maximum(_TOLERANCE, _WANDERS * noise)
         is_neutral = (seen.digits > _DIGITS) & (jnp.abs(growth) < _NEUTRAL)
         is_torus = seen.successful & is_neutral & moves_on
         torus = jnp.where(is_torus, REGIMES.quasiperiodic, before)

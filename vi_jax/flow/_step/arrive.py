@@ -187,6 +187,9 @@ def _after_friction(
 
     def settled(modes: Scalars) -> Scalars:
         contact = lane.contact or ()
+        # A slip whose event happened is zero now, to the rounding of a surface's speed.
+        given = {i: jnp.where(here, 0.0, modes[i]) for i, (_, here) in events.items()}
+        modes = tuple(given.get(i, mode) for i, mode in enumerate(modes))
         return constant_modes(
             settled_modes(plan.machine, lane.s, lane.state, modes, contact, released), lane.s
         )

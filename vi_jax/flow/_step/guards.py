@@ -86,15 +86,18 @@ def events_within_step(plan: Plan, state: State) -> list[int]:
 
 
 def guards_error(
-    plan: Plan, inner: InnerGuards, stages: list[Stage], h: Scalar, longest: Scalar
+    plan: Plan, lane: Lane, inner: InnerGuards, stages: list[Stage], h: Scalar, longest: Scalar
 ) -> Scalar | None:
     """Return the largest error of the guards at the stages of a step, relative to the tolerance;
     `None` without guards, or for a method without an estimate."""
     events, errors = events_of(plan.machine), [inner.error]
     for number, sides in inner.events.items():
-        acts = events[number].holds_mode
+        event, acts = events[number], events[number].holds_mode
+        is_stop = isinstance(event, RigidStop)
+        extent = plan.extent(event.coordinate) if is_stop else plan.guard_extent(number, lane)
+        size = plan.in_units(extent)
         errors += [
-            plan.method.guard_error(stages, x, h, longest, acts=acts, size=plan.unit) for x in sides
+            plan.method.guard_error(stages, x, h, longest, acts=acts, size=size) for x in sides
         ]
     known = [error for error in errors if error is not None]
     return functools.reduce(jnp.maximum, known) if known else None
@@ -157,12 +160,11 @@ def inner_guards(
     events = at_places(guards)(places) if checked else {}
     if not limited:
         return InnerGuards({}, events, slow, {})
-    # The integral of a force is a velocity.
-    size = 1 / plan.unit
 
     def of_forces(places: tuple) -> tuple[dict[int, Array], Scalar, dict[int, Scalar]]:
         forces, error, slack = at_places(pulls)(places), jnp.zeros_like(h), {}
         for k, x in forces.items():
+            size = plan.extent(k) / plan.unit  # the integral of a force is a velocity
             force_error = plan.method.guard_error(stages, x, h, longest, acts=True, size=size)
             error = error if force_error is None else jnp.maximum(error, force_error)
             slack[k] = 64 * float(jnp.finfo(h.dtype).eps) * jnp.max(jnp.abs(x))

@@ -227,7 +227,8 @@ def after_impulse(plan: Plan, lane: Lane, reached: Flag, completed: Flag) -> Lan
     if _may_change_modes(plan):
         # A body that was moved does not rest any more, which affects friction on its stop.
         contact = contacts_after_jump(plan, lane, reached, old.state) or ()
-        modes = struck_modes(plan.machine, lane.s, lane.state, lane.modes, contact=contact)
+        jumped = lane.s, lane.state, lane.modes
+        modes = struck_modes(plan.machine, *jumped, contact=contact, before=old.state)
         lane = lane._replace(modes=select(reached, modes, old.modes))
     lane = after_jump(plan, lane, reached, old.state)
     freed = release_pulled(plan, lane, reached, reached, (old.state, old.modes))

@@ -30,12 +30,14 @@ from ...machine import (
     impact_on,
     limited_in,
     longest_step,
+    on_held_surfaces,
     push_gains,
     row_of,
     stops_of,
     stops_on,
     strike,
     struck_modes,
+    switches_of,
 )
 from ..lane import Lane, add_entry, any_of, select, to_event, with_item
 from ..plan import Plan
@@ -389,7 +391,7 @@ def bring_to_rest(
         near, distances = _near_contacts(step.plan, lane, met, impacts)
         rests, times = _resting_bodies(step.plan, lane, near, distances)
         impacts = near
-    return _hold_resting(step.plan, step.taken, lane, rests, impacts, times)
+    return _hold_resting(step.plan, step.taken, lane, at_event, rests, impacts, times)
 
 
 def _near_contacts(
@@ -418,11 +420,12 @@ def _near_contacts(
 
 
 def _hold_resting(
-    plan: Plan, taken: Flag, lane: Lane, rests: dict[int, Flag], impacts: dict[int, ImpactResult],
-    times: dict[int, Scalar],
+    plan: Plan, taken: Flag, lane: Lane, at_event: State, rests: dict[int, Flag],
+    impacts: dict[int, ImpactResult], times: dict[int, Scalar],
 ) -> Lane:  # fmt: skip
     """Return the lane after the infinitely many last impacts, with those bodies held that come to
-    rest. For each coordinate: `rests`, whether it does; `times`, the time until then (in s)."""
+    rest; `at_event` is the state before the impacts. For each coordinate: `rests`, whether it does;
+    `times`, the time until then (in s)."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     wait = jnp.zeros_like(s)
@@ -433,14 +436,15 @@ def _hold_resting(
     contacts, modes = {k: impact.contact for k, impact in impacts.items()}, lane.modes
     if has_contact_friction(plan.machine):
         # The direction of slip is known after the impact.
-        modes = struck_modes(plan.machine, s, state, modes, contact=contact)
+        modes = struck_modes(plan.machine, s, state, modes, contact=contact, before=at_event)
         slowed, rebound_energy = _without_rebounds(plan, s, state, modes, rests, contacts)
         still, lost = stop_bodies(plan, s, slowed, rests, contacts)
         lost = lost + rebound_energy
     else:
         still, lost = stop_bodies(plan, s, state, rests, contacts)
         if holds_anywhere(plan.machine):
-            modes = struck_modes(plan.machine, s, still, modes, contact=contact)
+            modes = struck_modes(plan.machine, s, still, modes, contact=contact, before=at_event)
+            still, modes = _stuck_by_then(plan, s, still, modes, contact, wait)
     resting, integrals = hold_contacts(plan.machine, modes, contact), lane.record.integrals
     flow = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
     end, still, passed = flow.extrapolate(pin(wait))
@@ -462,6 +466,29 @@ def _hold_resting(
         energy = energy + jnp.where(taken & any_rests, lost, 0.0)
         lane = lane.update_record(impact_energy=energy)
     return lane
+
+
+def _stuck_by_then(
+    plan: Plan, s: Scalar, state: State, modes: Scalars, contact: Scalars, wait: Scalar
+) -> tuple[State, Scalars]:
+    """Return state and modes of bodies at rest, without slips that vanish before the last impact: a
+    body that slides between impacts comes to rest with them."""
+    machine, wait = plan.machine, stop_gradient(wait)
+    flow = hold_contacts(machine, modes, contact).field(s, state)
+    stuck, any_sticks = list(modes), jnp.zeros((), bool)
+    for i, friction in enumerate(switches_of(machine)):
+        if friction.is_dry:
+            slip = stop_gradient(friction.speed_of_slip(machine, s, state))
+            rate = stop_gradient(friction.slip_rate(machine, s, state, flow))
+            ends = (jnp.abs(modes[i]) == 1) & (slip * rate < 0)
+            ends = ends & (jnp.abs(slip) <= jnp.abs(rate) * wait)
+            stuck[i], any_sticks = jnp.where(ends, 0.0, modes[i]), any_sticks | ends
+
+    def stopped(_: None) -> tuple[State, Scalars]:
+        still = on_held_surfaces(machine, s, state, tuple(stuck), contact)
+        return still, struck_modes(machine, s, still, tuple(stuck), contact=contact, before=still)
+
+    return jax.lax.cond(any_sticks, stopped, lambda _: (state, modes), None)
 
 
 def _without_rebounds(

@@ -209,7 +209,7 @@ def try_step(
 
     longest = jnp.asarray(limit)
     inner = inner_guards(plan, lane, free_machines, ends, stages, at, h, longest)
-    guard_error = guards_error(plan, inner, stages, h, longest)
+    guard_error = guards_error(plan, lane, inner, stages, h, longest)
     error = error if guard_error is None else jnp.maximum(error, guard_error)
     piece = None
     if plan.memory is not None:

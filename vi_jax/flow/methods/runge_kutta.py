@@ -1,6 +1,5 @@
 """Methods with steps of a diffrax Runge–Kutta solver, sized by their error or of fixed number."""
 
-import functools
 import sys
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
@@ -376,8 +375,6 @@ class Adaptive(_RungeKutta):
         values = jax.lax.stop_gradient(values)
         error = jnp.sum(np.asarray([x.weight for x in stages]) * values)
         atol = atol if isinstance(size, float) and size == 1.0 else atol * size
-        if self.sizes is not None:
-            atol = atol * functools.reduce(jnp.maximum, map(jnp.max, jtu.tree_leaves(self.sizes)))
         return jnp.abs(h * error) / (atol + rtol * longest * jnp.max(jnp.abs(values)))
 
     def tighter(self):

@@ -1,0 +1,77 @@
+"""The unit of each component, the section and the order of events do not change orbits and
+branches."""
+
+import jax
+import numpy as np
+import pytest
+import vi_jax as vi
+
+from own_units import MACHINES, Colliding, Cranked, Pair, Struck, variants
+
+pytestmark = pytest.mark.slow
+
+
+def found_by(machine):
+    settled = vi.simulate(machine, machine.start(), 1, settle=60).last
+    return vi.find_orbit(machine, settled, throw=True)
+
+
+def numbers_of(orbit):
+    sizes = np.sort(np.abs(orbit.multipliers))
+    return np.array([*sizes, orbit.duration]), (int(orbit.impacts), int(orbit.rests))
+
+
+def assert_same_orbits(kind, tolerance):
+    """Multipliers, period and impacts do not depend on section and order; nor does the state, in
+    the first units, of a machine with the same section."""
+    first = None
+    for machine in variants(kind):
+        orbit = found_by(machine)
+        found, counts = numbers_of(orbit)
+        first = first or (found, counts, machine.row(orbit.state))
+        case = f"{machine.scales} {machine.phase} {machine.is_flipped}"
+        np.testing.assert_allclose(found, first[0], rtol=tolerance, atol=tolerance, err_msg=case)
+        assert counts == first[1], case
+        if machine.phase == 0:
+            row = machine.row(orbit.state)
+            np.testing.assert_allclose(row, first[2], rtol=tolerance, atol=tolerance, err_msg=case)
+
+
+@pytest.mark.parametrize("kind", MACHINES)
+def test_orbits(kind):
+    assert_same_orbits(kind, 1e-8)
+
+
+@pytest.mark.parametrize("kind", MACHINES)
+def test_orbits_in_single_precision(kind):
+    with jax.enable_x64(False):
+        assert_same_orbits(kind, 2e-3)
+
+
+# A multiplier is infinite at a grazing that ends a branch.
+@pytest.mark.parametrize("kind", MACHINES)
+def test_branches(kind):
+    first = None
+    for machine in variants(kind):
+        branch = vi.continue_orbit(
+            found_by(machine), parameter="p", bounds=kind.bounds, progress=False
+        )
+        found = branch.ends, [(x.kind, round(x.parameter, 8)) for x in branch.special]
+        first = first or found
+        assert found == first, (machine.scales, machine.phase, machine.is_flipped)
+
+
+@pytest.mark.parametrize("kind", [Struck, Pair, Colliding, Cranked])
+def test_local_maps(kind):
+    first = None
+    for machine in variants(kind):
+        branch = vi.continue_orbit(
+            found_by(machine), parameter="p", bounds=kind.bounds, progress=False
+        )
+        point = next(x for x in branch.special if x.kind == "grazing")
+        graze = vi.grazing(point, check=False)
+        entries = graze.entries / np.abs(graze.entries).max()
+        found = graze.touched.split()[0], str(graze.outcome), graze.forecast.period.tolist()
+        first = first or (found, entries)
+        assert found == first[0], (machine.scales, machine.phase, machine.is_flipped)
+        np.testing.assert_allclose(entries, first[1], rtol=0, atol=1e-6)

@@ -1,0 +1,291 @@
+"""Ten machines in which each component has a unit of its own, as a parameter. A change of these
+units, of the section or of the order of contacts and events does not change an answer."""
+
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+
+FACTORS = 1e-6, 1e6
+
+
+def ordered(is_flipped, *parts):
+    return parts[::-1] if is_flipped else parts
+
+
+class _InUnits(vi.AbstractMachine):
+    scales: Any
+    p: Any
+    phase: Any = 0.0
+    is_flipped: bool = eqx.field(static=True, default=False)
+
+    names: ClassVar[tuple[str, ...]]
+    begins: ClassVar[tuple[float, ...]]
+    value: ClassVar[float]
+    """The parameter p."""
+    bounds: ClassVar[tuple[float, float]]
+    """Its interval."""
+    linked: ClassVar[tuple[tuple[int, ...], ...]] = ()
+    """Components with one unit."""
+
+    def start(self):
+        return vi.State(**{n: self.scales[i] * self.begins[i] for i, n in enumerate(self.names)})
+
+    def field(self, t, z, *modes):
+        values = [getattr(z, n) / self.scales[i] for i, n in enumerate(self.names)]
+        rates = self.rates(t, *values, *modes)
+        return {n: self.scales[i] * rates[i] for i, n in enumerate(self.names)}
+
+    def row(self, state):
+        """Return a state in the first units."""
+        return np.stack([getattr(state, n) / self.scales[i] for i, n in enumerate(self.names)])
+
+
+class Struck(_InUnits):
+    """A body between two stops, a filter and a slow sum."""
+
+    names, begins, value, bounds = ("x", "u", "q", "w"), (0.1, 0.2, 0.0, 0.0), 0.6, (0.45, 0.9)
+    cycle = 2 * np.pi / 0.8
+
+    @property
+    def contacts(self):
+        on, x = ("x", "u"), self.scales[0]
+        left = vi.RigidStop(1.2 * x, 0.5, "left", on=on)
+        return ordered(self.is_flipped, vi.RigidStop(self.p * x, 0.7, on=on), left)
+
+    def rates(self, t, x, u, q, w):
+        push = jnp.cos(0.8 * t + self.phase) - x - 0.1 * u - 0.2 * q
+        return u, push, 0.5 * (x - q), 0.2 * (x * x - w)
+
+
+class Rubbed(_InUnits):
+    """Dry friction next to a stop, with a pressure."""
+
+    names, begins, value, bounds = ("x", "u", "P", "w"), (0.1, 0.2, 100.0, 0.0), 0.4, (0.1, 0.8)
+    cycle = 2 * np.pi / 0.4
+
+    @property
+    def contacts(self):
+        x, u, *_ = self.scales
+        rubs = vi.DryFriction(self.p * u, on="u")
+        return ordered(self.is_flipped, rubs, vi.RigidStop(0.9 * x, 0.6, on=("x", "u")))
+
+    def rates(self, t, x, u, P, w):
+        push = 1.1 * jnp.cos(0.4 * t + self.phase) - x + 0.05 * (P - 100)
+        return u, push, 0.5 * (x - (P - 100)), 0.2 * (x * x - w)
+
+
+class Cushioned(_InUnits):
+    """Soft stops on both sides."""
+
+    names, begins, value, bounds = ("x", "u", "P", "w"), (0.1, 0.2, 100.0, 0.0), 0.5, (0.3, 0.75)
+    linked = ((0, 1),)
+    cycle = 2 * np.pi / 0.9
+
+    @property
+    def contacts(self):
+        more = {"adhesive": False, "on": ("x", "u")}
+        return ordered(
+            self.is_flipped,
+            vi.SoftStop(self.p * self.scales[0], 40.0, damping=0.2, **more),
+            vi.SoftStop(0.7 * self.scales[0], 30.0, damping=0.1, side="left", **more),
+        )
+
+    def rates(self, t, x, u, P, w):
+        push = jnp.cos(0.9 * t + self.phase) - x - 0.1 * u + 0.2 * (P - 100)
+        return u, push, 0.5 * (x - (P - 100)), 0.2 * (x * x - w)
+
+
+class Heater(_InUnits):
+    """A switch with hysteresis in a room of varying temperature."""
+
+    names, begins, value, bounds = ("T", "room", "sum"), (300.0, 285.0, 0.0), 1.7, (1.5, 1.9)
+    cycle, modes = 1.0, {"on": 0.0}
+
+    @property
+    def events(self):
+        def turned(sign, to):
+            def guard(m, t, z, on):
+                return sign * (z.T / m.scales[0] - 295) - m.p
+
+            return vi.Reset(guard, modes=lambda *_: to)
+
+        return ordered(self.is_flipped, turned(-1, 1.0), turned(1, 0.0))
+
+    def rates(self, t, T, room, total, on):
+        varies = 285 + 3 * jnp.cos(2 * jnp.pi * t + self.phase) - room
+        return 25 * on - 2 * (T - room), 0.5 * varies, on - total
+
+
+class Belted(_InUnits):
+    """A body on a belt. Cycles end with its turns."""
+
+    names, begins, value, bounds = ("x", "u", "w"), (1.2, 0.2, 0.0), 0.6, (0.3, 2.5)
+    cycle = vi.rising("u", usual=6.3)
+
+    @property
+    def contacts(self):
+        speed = self.scales[1]
+        level = lambda v: speed * (0.5 + 0.5 * jnp.exp(-2 * v / speed))
+        return vi.DryFriction(level, slip=lambda z: z.u - self.p * speed, on="u")
+
+    def rates(self, t, x, u, w):
+        return u, -x - 0.1 * u, 0.4 * (x - w)
+
+
+class Valve(_InUnits):
+    """A body that excites itself strikes a stop; with a pressure."""
+
+    names, begins, value, bounds = ("x", "u", "P"), (0.2, 0.0, 100.0), 0.8, (0.3, 1.2)
+    cycle = vi.rising("u", usual=6.3)
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(self.p * self.scales[0], 0.8, on=("x", "u"))
+
+    def rates(self, t, x, u, P):
+        return u, 0.5 * u * (1 - x * x) - x + 0.2 * (P - 100), 0.7 * (x - (P - 100))
+
+
+class Sliding(_InUnits):
+    """A surface along which the state slides, and impacts that are resets with wear."""
+
+    names, begins, value, bounds = ("x", "u", "w"), (0.5, 0.3, 0.0), 0.5, (0.2, 0.9)
+    cycle = 2 * np.pi / 0.5
+
+    @property
+    def events(self):
+        def surface(m, t, z):
+            return z.u / m.scales[1] + 0.2 * z.x / m.scales[0]
+
+        def worn(m, t, z, *_):
+            return {"u": -0.7 * z.u, "w": z.w + 0.1 * m.scales[2] * z.u / m.scales[1]}
+
+        strikes = vi.Reset(lambda m, t, z, *_: z.x / m.scales[0] - 0.6, worn)
+        return ordered(self.is_flipped, vi.Switch(surface, slides=True), strikes)
+
+    def rates(self, t, x, u, w, side):
+        push = 1.2 * jnp.cos(0.5 * t + self.phase) - x - self.p * side - 0.1 * u
+        return u, push, -0.3 * w
+
+
+class _Linked(vi.Mechanical):
+    """Two bodies, each coordinate in a unit of its own."""
+
+    scales: Any
+    p: Any
+    phase: Any = 0.0
+    is_flipped: bool = eqx.field(static=True, default=False)
+
+    q = ("a", "b")
+    linked: ClassVar[tuple[tuple[int, ...], ...]] = ()
+    names: ClassVar[tuple[str, ...]] = q
+    inertia: ClassVar[Any]
+    begins: ClassVar[tuple[float, ...]]
+
+    def start(self):
+        return self.at(**{n: self.scales[i] * self.begins[i] for i, n in enumerate(self.q)})
+
+    def mass(self, q):
+        return jnp.asarray(self.inertia) / jnp.outer(self.scales, self.scales)
+
+    def force(self, t, q, v):
+        states = [getattr(x, n) / self.scales[i] for x in (q, v) for i, n in enumerate(self.q)]
+        found = self.forces(t, *states)
+        return {n: found[i] / self.scales[i] for i, n in enumerate(self.q)}
+
+    def row(self, state):
+        states = (getattr(x, n) / self.scales[i] for x in (state, state.v)
+                  for i, n in enumerate(self.q))  # fmt: skip
+        return np.stack(list(states))
+
+
+class Pair(_Linked):
+    """Two bodies with a spring and a full mass matrix, each with a stop."""
+
+    inertia, begins, value, bounds = ((1.0, 0.2), (0.2, 2.0)), (0.1, 0.0), 0.5, (0.3, 0.75)
+    cycle = 2 * np.pi / 0.7
+
+    @property
+    def contacts(self):
+        a, b = self.scales
+        left = vi.RigidStop(0.55 * b, 0.5, "left", on="b")
+        return ordered(self.is_flipped, vi.RigidStop(self.p * a, 0.7, on="a"), left)
+
+    def forces(self, t, a, b, va, vb):
+        spring = 0.3 * (a - b)
+        push = jnp.cos(0.7 * t + self.phase) - a - 0.1 * va
+        return push - spring, spring - b - 0.1 * vb - 0.3
+
+
+class Colliding(_Linked):
+    """Two bodies that strike each other, one with dry friction."""
+
+    inertia, begins, value, bounds = ((1.0, 0.0), (0.0, 1.5)), (0.1, 0.5), 0.3, (0.1, 0.6)
+    cycle = 2 * np.pi / 0.9
+
+    @property
+    def contacts(self):
+        a, b = self.scales
+        between = vi.RigidStop(self.p, 0.6, on=lambda q: q.a / a - q.b / b)
+        return ordered(self.is_flipped, between, vi.DryFriction(0.1 / b, on="b"))
+
+    def forces(self, t, a, b, va, vb):
+        return jnp.cos(0.9 * t + self.phase) - a - 0.1 * va, -1.3 * b - 0.2 * vb
+
+
+class Cranked(_Linked):
+    """A motor's crank shakes a body against a stop. Cycles are turns of an angle, in radians."""
+
+    q = names = ("phi", "y")
+    value, bounds, linked = 0.9, (0.6, 1.1), ((1,),)
+    cycle = vi.turn_of("phi", usual=0.45)
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(0.08 * self.scales[1], 0.5, on="y")
+
+    def mass(self, q):
+        return 0.06 + 0.2 * (0.04 * jnp.sin(q.phi)) ** 2, 0.35 / self.scales[1] ** 2
+
+    def forces(self, t, phi, y, speed, v):
+        spring = 88.8 * (y - 0.04 * jnp.cos(phi))
+        torque = 10.0 * (self.p - speed / 15.93)
+        return torque - 0.04 * spring * jnp.sin(phi), -spring - 0.5 * v
+
+    def start(self):
+        return self.at(v={"phi": 14.0})
+
+
+MACHINES = (Struck, Rubbed, Cushioned, Heater, Belted, Valve, Sliding, Pair, Colliding, Cranked)
+
+
+def is_driven(kind):
+    return isinstance(kind.cycle, float)
+
+
+def machine_of(kind, scales=None, phase=0.0, *, is_flipped=False, p=None):
+    scales = np.ones(len(kind.names)) if scales is None else scales
+    numbers = (jnp.asarray(x, float) for x in (scales, kind.value if p is None else p, phase))
+    return kind(*numbers, is_flipped=is_flipped)
+
+
+def units_of(kind):
+    """Return the scales of components: each alone in a unit 1e-6 and 1e6 times as large."""
+    number = len(kind.names)
+    alone = [(i,) for i in range(number) if all(i not in x for x in kind.linked)]
+    alone = list(kind.linked) if kind is Cranked else [*kind.linked, *alone]
+    return [np.where(np.isin(np.arange(number), x), f, 1.0) for x in alone for f in FACTORS]
+
+
+def variants(kind) -> Iterator[Any]:
+    """Yield a machine in its first units, then in others, and if it is driven with another section
+    and in another order of contacts and events."""
+    yield machine_of(kind)
+    yield from (machine_of(kind, scales) for scales in units_of(kind))
+    if is_driven(kind):
+        yield machine_of(kind, phase=0.37)
+        yield machine_of(kind, is_flipped=True)
