@@ -341,7 +341,7 @@ class Busy(vi.AbstractMachine):
         return Two(q.u, push - pull, q.v, 2.0 * (q.x - q.z) - 0.1 * q.v - 0.5 * q.z)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_a_rest_with_friction_a_switch_and_a_reset():
     """All of them act in every cycle, and the friction sticks. Compare with settled simulations and
     differences of their map."""

@@ -7,6 +7,7 @@ from functools import partial
 from math import ceil
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -510,8 +511,9 @@ def resting_problem_of(
         held=_contact(machine, state, order),
     )  # fmt: skip
     clock = np.array([place for place, _ in events])
-    rows = _states_at(problem, orbit, run, clock - _EARLIER * begins[-1] / cycles, begins)
-    modes = _modes_in_legs(problem, orbit.state, clock, rows, begins[-1])
+    earlier = _EARLIER * begins[-1] / cycles
+    rows = _states_at(problem, orbit, run, clock - earlier, begins)
+    modes = _modes_in_legs(problem, orbit.state, clock, (rows, earlier), begins[-1])
     problem = dataclasses.replace(problem, modes=modes)
     rows = rows if events else np.asarray(raveled(orbit.state)[0])
     x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)], begins[-1]))
@@ -562,18 +564,23 @@ def _state_at(machine, method, like, row, modes, clock):
 
 
 def _modes_in_legs(
-    problem: Shooting, state: Any, clocks: np.ndarray, rows: np.ndarray, period: float
-) -> Modes:
-    """Return the machine's modes in each leg, from the first state and each event's."""
-    machine, start = problem.machine, jnp.zeros(())
+    problem: Shooting, state: Any, clocks: np.ndarray, before: tuple[np.ndarray, float],
+    period: float,
+) -> Modes:  # fmt: skip
+    """Return the machine's modes in each leg, from the first state, and the states this time
+    `before` each event."""
+    machine, start, (rows, earlier) = problem.machine, jnp.zeros(()), before
     modes = begin_modes(machine, start, without_modes(state), modes_of(state))
     found = [modes] * problem.legs
     first = int(np.searchsorted(clocks, period))
     for i in [*range(first, len(clocks)), *range(first)]:
-        event, before = problem.events[i], problem.unravel(jnp.asarray(rows[i]))
+        event, at_event = problem.events[i], problem.unravel(jnp.asarray(rows[i]))
         if event.use != LEAVES:
             s, contact = jnp.asarray(clocks[i]), problem.flight(machine, i - 1).contact
-            modes = after_event(machine, event.number, s, before, modes, contact)[1]
+            # A force that releases a body is not too large before.
+            rate = SmoothMachine(machine, modes, contact).field(s, at_event)
+            at_event = jax.tree.map(lambda x, v: x + earlier * v, at_event, rate)
+            modes = after_event(machine, event.number, s, at_event, modes, contact)[1]
         found[i] = modes
     return tuple(tuple(float(mode) for mode in modes) for modes in found)
 
