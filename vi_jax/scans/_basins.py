@@ -359,7 +359,7 @@ class _Mapper:
             cycles, here = int(period[lane]), (states[lane], modes[lane])
             motion_of_cell[i] = index_of(motions, cycles, *here, self.apart)
             if motion_of_cell[i] == len(motions):
-                sections = self._sections_from(data, machine, lane, cycles, *here)
+                sections = self._sections_from(data, machine, int(lane), cycles, *here)
                 motions.append(MotionSections(*sections, unit, angles))
         found = motion_of_cell[inverse.ravel()]
         order = np.argsort(-np.bincount(found), kind="stable")
