@@ -148,7 +148,8 @@ def seconds(program: str, root: Path, cache: str) -> float:
         }  # fmt: skip
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     command = [sys.executable, "-c", program]
-    subprocess.run(command, env=environment, stdout=subprocess.DEVNULL, check=True)
+    # The working folder precedes `PYTHONPATH`.
+    subprocess.run(command, env=environment, cwd=root, stdout=subprocess.DEVNULL, check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
