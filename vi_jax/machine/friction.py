@@ -96,21 +96,26 @@ class Friction(AbstractSwitch):
     ) -> Scalar:
         """Return the sign of the slip; zero if the slip is rounding. Its size is that of its terms,
         and its change by the rate `flow` in 1/2π of a cycle."""
-        slip, sizes = self.speed_of_slip(machine, s, state), jtu.tree_map(jnp.abs, state)
-        size = size_of(lambda x: self.speed_of_slip(machine, s, x), state, sizes)
+        slip, size = self.speed_of_slip(machine, s, state), self._size(machine, s, state)
         if flow is not None:
             rate = self.largest_rate(machine, s, state, flow)
             size = size + jnp.asarray(machine.cycle) / (2 * pi) * rate
-        least = stop_gradient(self.roundings * float(jnp.finfo(slip.dtype).eps) * size)
-        return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
+        return jnp.where(jnp.abs(slip) <= self._rounding(slip, size), 0.0, jnp.sign(slip))
 
     def changes(self, machine: Machine, s: Scalar, before: State, after: State) -> Flag:
         """Return whether a jump changes the slip, by more than rounding."""
-        slips = [stop_gradient(self.speed_of_slip(machine, s, x)) for x in (before, after)]
-        sizes = jtu.tree_map(jnp.abs, stop_gradient(before))
-        size = size_of(lambda x: self.speed_of_slip(machine, s, x), before, sizes)
-        least = self.roundings * float(jnp.finfo(size.dtype).eps) * (size + jnp.abs(slips[1]))
-        return jnp.abs(slips[1] - slips[0]) > least
+        old, new = (stop_gradient(self.speed_of_slip(machine, s, x)) for x in (before, after))
+        size = self._size(machine, s, before) + jnp.abs(new)
+        return jnp.abs(new - old) > self._rounding(new, size)
+
+    def _size(self, machine: Machine, s: Scalar, state: State) -> Scalar:
+        """Return the size of the terms of the slip."""
+        slip = lambda x: self.speed_of_slip(machine, s, x)
+        return size_of(slip, state, jtu.tree_map(jnp.abs, state))
+
+    def _rounding(self, slip: Scalar, size: Scalar) -> Scalar:
+        """Return the rounding of a slip with terms of this size."""
+        return stop_gradient(self.roundings * float(jnp.finfo(slip.dtype).eps) * size)
 
     def begin(self, machine, s, state):
         """Return the direction of slip: `settled_modes` decides which bodies stick."""

@@ -53,7 +53,8 @@ class Shown(eqx.Module):
                 f"`{cls.__name__}` has no argument `{wrong}`: a number is declared with its "
                 f"type in the class, `{wrong}: float = {getattr(cls, wrong)!r}`."
             )
-        taken = inspect.signature(cls.__init__).parameters if wrong else {}  # also of its own
+        # A class may write `__init__`, with other arguments than its fields.
+        taken = inspect.signature(cls.__init__).parameters if wrong else {}
         if wrong and wrong not in taken and all(x.kind != x.VAR_KEYWORD for x in taken.values()):
             names = [name for name in taken if name != "self"]
             known = near_names(wrong, names) if names else "it takes none"

@@ -70,7 +70,8 @@ class Vectors(NamedTuple):
     right: np.ndarray
 
 
-# A test of a step returns its value and its vectors, with the signs of those of a nearby step.
+# A function of a point on a curve that is zero at a point of codimension two. It also returns the
+# null vectors that it used, if any, with the signs of those of a nearby point.
 Test = Callable[[Step, Vectors | None], tuple[float, Vectors | None]]
 
 

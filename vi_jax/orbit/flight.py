@@ -109,7 +109,7 @@ class Flight(eqx.Module):
         return ravel_pytree(self.like)[1](u)
 
     def rate(self, s: Scalar, u: Vector) -> Vector:
-        """Return f(s, u)."""
+        """Return du/ds, the rate of the state along this flight."""
         return ravel_pytree(self.smooth.field(s, self.unravel(u)))[0]
 
     def step(

@@ -497,7 +497,7 @@ def distance(here: Any, there: Any, unit: Any = 1) -> Any:
 
 
 class MotionSections(NamedTuple):
-    """The sections of a periodic motion, and the measure of distance by which it is recognised."""
+    """The sections of a periodic motion, and what its distance from another is measured by."""
 
     states: Float[np.ndarray, "cycles states"]
     modes: Float[np.ndarray, "cycles modes"]

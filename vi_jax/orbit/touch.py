@@ -186,7 +186,7 @@ class Touch(NamedTuple):
     gradient: np.ndarray
     """∂h, the distance's derivative with respect to the state."""
     rate: float
-    """a = d²h/ds², positive."""
+    """a, the second derivative of the distance h from the event with respect to s; positive."""
     slope: float
     """Derivative of the least distance with respect to the parameter, along the motion."""
     kick: Kick
