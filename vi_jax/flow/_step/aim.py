@@ -173,7 +173,7 @@ def _bump(share: np.ndarray) -> np.ndarray:
 def may_turn_twice(plan: Plan, direction: Scalar, path: Path, h: Scalar) -> Flag:
     """Return whether the velocity, of one sign at both ends, may have been zero in between. Then
     the step is halved, until each step has one turning point or the dip is too short to matter. The
-    rates of the force, if known, show whether it sags; else it counts as linear."""
+    rates of the force show whether it sags; where they are unknown, it counts as linear."""
     begin, end = path.begin, path.end
     a0, a1 = direction * begin.a, direction * end.a
     dips = (a0 < 0) & (a1 > 0) & (h > plan.in_units(_SHORTEST_DIP))
@@ -185,7 +185,7 @@ def may_turn_twice(plan: Plan, direction: Scalar, path: Path, h: Scalar) -> Flag
     j0, j1 = direction * path.near.begin, direction * path.near.end
     sags = dips & (j0 * h < a1 - a0) & (a1 - a0 < j1 * h)
 
-    def sagging(_: None) -> Flag:
+    def sagging(_: object) -> Flag:
         corner, low, _ = _corner((a0, j0), (a1, j1), h, sags)
         deep = 0.5 * corner * (a0 + low) - 0.5 * low * low / jnp.where(sags, j1, 1.0)
         flat = -0.5 * a0 * a0 / jnp.where(sags & (low >= 0), j0, 1.0)
@@ -466,8 +466,9 @@ class _Found(NamedTuple):
 def _may_have_met(plan: Plan, lane: Lane, trial: Trial, found: _Found, foreseen: bool) -> Flag:
     """Return whether a step may have met anything; if not, `_next_goal` need not be evaluated."""
     met = trial.good & ((lane.target != FREE) & ~is_at_turn(trial) | found.twice)
-    for k, (hidden, _) in found.windows.items():
-        met = met | hidden | trial.paths[k].near.release.left
+    for k, path in enumerate(trial.paths):
+        if path.near is not None:
+            met = met | found.windows[k][0] | path.near.release.left
     for crossing, over, _ in found.guards:
         met = met | over & ~crossing.landed | crossing.again
     for above, _ in (*found.humps, *found.rises):
@@ -541,12 +542,12 @@ def _find_events(plan: Plan, lane: Lane, trial: Trial) -> _Found:
     eps = float(jnp.finfo(h.dtype).eps)
     for k, path in enumerate(trial.paths):
         if path.near is not None:
+            left, landed, _, _ = path.near.release
             hidden, place = force_may_turn(lane, k, path, h)
             windows[k] = good & hidden, place
-        if path.pull is not None and path.near is not None:
-            left, landed = path.near.release.left, path.near.release.landed
-            sides.append(path.pull)
-            below.append(~left & ((path.pull.end.x <= 0) | landed) & path.pull.is_used)
+            if path.pull is not None and path.pull.is_used is not None:
+                sides.append(path.pull)
+                below.append(~left & ((path.pull.end.x <= 0) | landed) & path.pull.is_used)
         end, twice = path.end, twice | may_turn_twice(plan, lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
         if not stops_exact or any(x.blends for x in switches_of(plan.machine)):

@@ -322,8 +322,8 @@ def _path(
         def of_force(_: None) -> NearStop:
             release = locate_release(plan, lane, k, begin, end, good, h)
             places = (lane.s, lane.state), (s1, new)
-            grows = (force_rate(free, body, smooth, *place) for place in places)
-            return NearStop(release, *grows, brief)
+            first, last = (force_rate(free, body, smooth, *place) for place in places)
+            return NearStop(release, first, last, brief)
 
         def far(_: None) -> NearStop:
             no, zero = jnp.zeros_like(good), jnp.zeros_like(h)
