@@ -16,11 +16,10 @@ from .find import find_orbit
 from .from_orbit import check_parameter
 from .kinds import GRAZING, TORUS
 from .results import Orbit
-from .tolerances import SAME
+from .tolerances import ROUGHLY, SAME
 from .torus import (
     MOST,
     REORDERED,
-    RESOLVED,
     Torus,
     first_mode,
     margins_of,
@@ -254,7 +253,7 @@ class _Walk:
         if equations.unit(new.tangent) @ equations.pack(ahead) < SAME_CURVE:
             return STALLED
         finer = equations.refined(new, self.most)
-        if finer is None or equations.tail(finer.curve) > RESOLVED:
+        if finer is None or equations.tail(finer.curve) > ROUGHLY:
             return COARSE
         return finer
 

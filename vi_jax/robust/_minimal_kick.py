@@ -30,7 +30,7 @@ from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, components, in_rows, state_in_words, units_of
 from ..orbit import Orbit, cycle_map
 from ._edge_state import EdgeState, track_edge
-from ._settling import ELSEWHERE, RETURNS, Row, Rows, Settling, images, settling_on
+from ._settling import ELSEWHERE, RETURNS, UNCHANGED, Row, Rows, Settling, images, settling_on
 
 Kicks = Float[np.ndarray, "..."]
 """Kicks, the components in the last axis."""
@@ -221,8 +221,8 @@ def _around(unit: Row, angle: float, rng: np.random.Generator) -> Kicks:
 
 
 # Newton's method begins where the motion on the edge is this near to the saddle; it adds periods
-# until a kick moves by less than the second number, relative to its norm. Choices.
-_NEAR_SADDLE, _CONVERGED = 0.05, 1e-11
+# until a kick is `UNCHANGED`, relative to its norm. A choice.
+_NEAR_SADDLE = 0.05
 
 # A change below this, relative to the norm, is the method's error if it exceeds half the one
 # before: adaptive steps of 1e-11 leave some 1e-9 in a gradient. The kick is then final. A choice.
@@ -278,7 +278,7 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
 
 def _is_converged(change: float, last: float) -> bool:
     """Return whether a change, relative to the norm, is zero or within the method's error."""
-    return change <= _CONVERGED or last / 2 <= change <= _NOISE
+    return change <= UNCHANGED or last / 2 <= change <= _NOISE
 
 
 def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
@@ -345,9 +345,9 @@ _FEW_ROUNDS, _MANY_ROUNDS = 2, 14
 # Rounds of bisection by eight that leave nothing between two numbers of double precision.
 _ROUNDING = 18
 
-# Newton's kick may be longer than that of the rays by the first share, and shorter by the second:
-# otherwise it is another kick. A choice, for rays as dense as the default.
-_LONGER, _SHORTER = 1e-4, 0.05
+# Newton's kick may be shorter than that of the rays by this share, and not longer: otherwise it is
+# another kick. A choice, for rays as dense as the default.
+_SHORTER = 0.05
 
 # Most rounds of edge tracking.
 _ROUNDS = 40
@@ -518,7 +518,7 @@ def _exact(
     if edge.kind == "saddle" and edge.orbit is not None:
         better = shortest(settling, kick, edge.orbit, unit * outside)
         longer = np.nan if better is None else np.linalg.norm(better[0]) / outside - 1
-        if better is not None and -_SHORTER <= longer <= _LONGER:
+        if better is not None and -_SHORTER <= longer <= _SAME:
             return *better, True, edge
     narrow = angle / NARROWER**_FEW_ROUNDS
     unit, inside, outside = refine_direction(
