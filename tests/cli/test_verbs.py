@@ -4,6 +4,7 @@ import csv
 import importlib
 import os
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,14 @@ def rows(path):
 
 def is_png(path):
     return Path(path).read_bytes()[:4] == b"\x89PNG"
+
+
+def test_version(capsys):
+    assert vi.__version__ == metadata.version("vi-jax") and "__version__" in dir(vi)
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith("vi-jax ")
 
 
 def test_simulate_samples_and_cycles(run):
