@@ -85,11 +85,10 @@ class _End(NamedTuple):
 class TorusBranch:
     """A family of tori in one parameter, in order, from `continue_torus`.
 
-    It ends on each side at the "bounds"; by "grazing" (located: a stop is touched or an impact
-    lost); by "order" (two events, or an event and the section, change their order); by "resonance"
-    (the motion locks to a ratio p:q in a window that a step did not cross); by "coarse" (more nodes
-    are needed than allowed, as at a loss of smoothness); by "neimark-sacker" (the curve shrinks to
-    a periodic motion); by "stalled", "max_points" or "interrupted".
+    It ends as a `Branch` does, at a "grazing" that is located to rounding; by "order" (two events,
+    or an event and the section, change their order); by "resonance" (the motion locks to a ratio
+    p:q in a window that a step did not cross); by "coarse" (more nodes are needed than allowed, as
+    at a loss of smoothness); or by "neimark-sacker" (the curve shrinks to a periodic motion).
     """
 
     name: str
