@@ -16,7 +16,7 @@ from .find import find_orbit
 from .from_orbit import check_parameter
 from .kinds import GRAZING, TORUS
 from .results import Orbit
-from .tolerances import ROUGHLY, SAME
+from .tolerances import LOCATED, ROUGHLY, SAME
 from .torus import (
     MOST,
     REORDERED,
@@ -45,9 +45,9 @@ _SPURIOUS, _SHORTEST = 1e-3, 1e-2
 _REACH, _BACK = 2.0, 16
 
 # Angles at which the motions of a window are found, within the q-th part of a turn, odd. The high
-# modes of the parameter must be below this share of its range, or rounding. Its extrema, the
+# modes of the parameter must be below `LOCATED` of its range, or this rounding. Its extrema, the
 # window's ends, are sought at so many places. Choices.
-_ANGLES, _SMOOTH, _ROUNDING, _BETWEEN = 33, 1e-6, 1e-14, 8192
+_ANGLES, _ROUNDING, _BETWEEN = 33, 1e-14, 8192
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -328,7 +328,7 @@ class _Walk:
         values = np.array([cycle.p[-1] for cycle in cycles])
         middle = values.mean()
         high = np.abs(np.fft.rfft(values))[_ANGLES // 3 :].max() / _ANGLES
-        if high > _SMOOTH * np.ptp(values) + _ROUNDING * abs(middle):
+        if high > LOCATED * np.ptp(values) + _ROUNDING * abs(middle):
             return unknown
         between = interpolated((values - middle)[:, None], angles_of(_BETWEEN))
         low, high = middle + between.min(), middle + between.max()
