@@ -2,7 +2,7 @@
 
 import functools
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import copysign
@@ -159,6 +159,18 @@ class Text:
     def once(self, operation: str) -> str:
         """Append a scalar operation, merged as in `value`, and return its result's name."""
         return self.value(operation, "scalar").text
+
+    def call(self, operation: Callable[[], str], of: str) -> str:
+        """Append a call of a function without effects, merged with an equal one as in `value`, and
+        return its result's name. `of` is the function with its arguments; `operation` returns the
+        instruction, in which its scratch memory stands too."""
+        key = (of, "call")
+        for operations in self._operations:
+            if key in operations:
+                return operations[key].text
+        name = self.raw(operation())
+        self._operations[-1][key] = Value(name, "call")
+        return name
 
     def load(self, operation: str, kind: str) -> Value:
         """Append a load, merged with an equal one in this block since the last store."""

@@ -294,15 +294,19 @@ class Functions:
         found = self._found[key]
         if found is None:
             return None
-        block = t.arena.take(max(found.memory, 1))
-        values = [f"{t.vector(x.kind)} {x.text}" for x in (*_flat(args), mask)]
-        given = ", ".join([f"ptr {Memory(block).pointer(t)}", *values])
-        call = t.raw(f"call fastcc {self._type(t, found.results)} @{found.name}({given})")
+        values = ", ".join(f"{t.vector(x.kind)} {x.text}" for x in (*_flat(args), mask))
+        returned = self._type(t, found.results)
+
+        def written() -> str:
+            block = t.arena.take(max(found.memory, 1))
+            memory = f"ptr {Memory(block).pointer(t)}"
+            return f"call fastcc {returned} @{found.name}({memory}, {values})"
+
+        call = t.call(written, of=f"{found.name}({values})")
         number = iter(range(len(_numbers(found.results))))
 
         def result(kind: str) -> Value:
-            what = f"{self._type(t, found.results)} {call}, {next(number)}"
-            return Value(t.raw(f"extractvalue {what}"), kind)
+            return t.value(f"extractvalue {returned} {call}, {next(number)}", kind)
 
         return [
             Registers.of(shape, kind, lambda _, kind=kind: result(kind))
