@@ -453,13 +453,11 @@ def event_numbers(machine: AbstractMachine, kind: np.ndarray, number: np.ndarray
 
 @on_host
 def _fly(blank: Shooting, steps, modes, s0, s1, u):
-    """Return the state at clock `s1`, from `u` at `s0`, without an event in between."""
     return Flight(blank.machine, modes, blank.method, blank.like).fly(s0, s1, u, steps)[0]
 
 
 @on_host
 def _jump(blank: Shooting, number: int, s, u, modes):
-    """Return the state and the modes after the event of this number."""
     after, modes = after_event(blank.machine, number, s, blank.unravel(u), modes)
     return ravel_pytree(after)[0], modes
 

@@ -309,7 +309,6 @@ def first_mode(equations: Equations, curve: Curve) -> tuple[np.ndarray, float]:
 
 @on_host
 def _mapped(map_and_equations: tuple[CycleMap, Shooting], rows):
-    """Return the states on the section after the period of a map, from states on it."""
     the_map, problem = map_and_equations
     return jax.vmap(lambda row: raveled(the_map(begin_on_section(problem, row)))[0])(rows)
 

@@ -257,7 +257,6 @@ class _Walk:
         return finer
 
     def _append(self, new: Solved) -> None:
-        """Add a torus, and the windows that lie before it."""
         here = self.points[-1].curve
         for p, q in _ratios(here.rotation, new.curve.rotation):
             share = (p / q - here.rotation) / (new.curve.rotation - here.rotation)

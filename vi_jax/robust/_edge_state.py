@@ -156,11 +156,10 @@ def track_edge(
         section_states.append(sections)
         report(1)
         inside, outside = pair
-        recurrence = _recurrence(
-            np.concatenate(section_states)[-4 * longest - 1 :], longest, tolerance, settling
-        )
-        if recurrence is not None:
-            orbit = settling.orbit_near(*recurrence, _FARTHER * tolerance)
+        *before, last = np.concatenate(section_states)[-longest - 1 :]
+        near = settling.motion.between(np.array(before), last)[::-1] <= tolerance if before else []
+        if np.any(near):  # the motion has returned near to its state so many cycles before
+            orbit = settling.orbit_near(last, int(np.argmax(near)) + 1, _FARTHER * tolerance)
             if orbit is not None and not bool(orbit.stable):
                 return _described(settling, section_states, orbit)
             tolerance *= 0.1
@@ -181,16 +180,6 @@ def _follow_pair(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
         if separated.size:
             break
     return pair, np.concatenate(parts)
-
-
-def _recurrence(
-    section_states: Rows, longest: int, limit: float, settling: Settling
-) -> tuple[Row, int] | None:
-    """Return the last state if the motion has returned near to it, and the fewest cycles."""
-    last = section_states[-1]
-    distances = settling.motion.between(section_states[:-1], last)
-    near = np.flatnonzero(distances[::-1][:longest] <= limit)
-    return (last, int(near[0]) + 1) if near.size else None
 
 
 def _described(settling: Settling, section_states: list[Rows], orbit: Orbit | None) -> EdgeState:

@@ -371,7 +371,6 @@ def _cleaned(text: str) -> str:
 
 
 def _codes(program: ScanProgram) -> dict[str, str]:
-    """Return digests of the source of the user's own functions and classes."""
     parts: dict[str, Any] = {"machine": program.machine if program.build is None else program.build}
     parts |= {"start": program.start, "method": program.method}
     if program.lane_noise is not None and program.lane_noise.noise.functions:
