@@ -5,6 +5,7 @@ import json
 import shutil
 import warnings
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -140,38 +141,36 @@ def test_failed_lanes_do_not_count_as_damage(tmp_path):
     assert [str(w.message)[:7] for w in said] == ["256 of "]
 
 
-def test_another_source_or_tag_raises(tmp_path, monkeypatch):
+def test_another_function_with_equal_probed_lanes_raises(tmp_path, monkeypatch):
+    """The first and the last lane agree, so that only the code differs."""
     module = importlib.import_module("vi_jax.scans._scan")
     monkeypatch.setattr(module, "run_blocks", lambda *arguments: None)
 
-    def first(scene, run):
-        return {"depth": run.y_min[-1]}
+    def run(name, change=0.0, hidden=None):  # its functions close over `change` and `hidden`
+        def machine(zeta):
+            bump = change * (zeta - 0.8) * (1.2 - zeta)
+            return vi.Scene.ideal(frequency_ratio=zeta + bump, damping_ratio=0.02)
 
-    def second(scene, run):
-        return {"depth": run.y_max[-1]}
+        def measure(scene, run):
+            late = jnp.where(scene.drive.frequency_ratio > 0.9, 1.0 + change, 1.0)
+            return {"depth": late * run.y_min[-1], "hidden": 0.0 if hidden is None else 1.0}
 
-    typed = {}
-    exec("def typed(scene, run): return {'depth': run.y_min[-1]}", typed)
-
-    def run(store, measure, **options):
-        axes = {"drive.frequency_ratio": [0.8, 1.0, 1.2]}
-        options |= {"measure": measure, "settle": 5, "cycles": 4, "store": tmp_path / store}
+        scene, kept = (machine, "extremes") if name == "scene" else (SCENE, measure)
+        axes = {"zeta" if name == "scene" else "drive.frequency_ratio": [0.8, 1.0, 1.2]}
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "3 of 3 lanes failed .not_computed")
-            vi.scan(SCENE, axes, **options)
+            vi.scan(scene, axes, measure=kept, settle=5, cycles=4, store=tmp_path / name)
 
-    run("one", first, tag="1")
-    run("one", first, tag="1")
-    with pytest.raises(ValueError, match="the tag is 1, and now it is 2"):
-        run("one", first, tag="2")
-    second.__name__ = second.__qualname__ = first.__qualname__
-    with pytest.raises(ValueError, match=r"the code of measure 1 is \w+, and now it is \w+"):
-        run("one", second, tag="1")
-    run("two", typed["typed"])
+    for name, what in {"scene": "machine", "measure": "measure 1"}.items():
+        run(name)
+        run(name)
+        with pytest.raises(ValueError, match=rf"the code of {what} is \w+, and now it is \w+"):
+            run(name, change=0.1)
+    opaque = (x for x in "ab")
+    shutil.rmtree(tmp_path / "measure")
+    run("measure", hidden=opaque)
     with pytest.raises(ValueError, match=r"must be new, since it is unknown .* measure 1"):
-        run("two", typed["typed"])
-    run("three", typed["typed"], tag="1")
-    run("three", typed["typed"], tag="1")
+        run("measure", hidden=opaque)
 
 
 def test_a_store_of_another_release_warns(whole, tmp_path):

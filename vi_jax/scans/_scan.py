@@ -83,12 +83,11 @@ def workplace(workers: int | None, devices: int | None, cluster: object) -> Work
 
 
 def computed(
-    program: ScanProgram, blocks: Blocks, place: Workplace, store: Any = None, progress=False,
-    tag: str = "",
-) -> "xr.Dataset":  # fmt: skip
+    program: ScanProgram, blocks: Blocks, place: Workplace, store: Any = None, progress=False
+) -> "xr.Dataset":
     """Return the data of a program on a grid, checked before any work."""
     program = check_corners(program, blocks)
-    with contextlib.closing(opened(program, blocks, store, tag)) as storage:
+    with contextlib.closing(opened(program, blocks, store)) as storage:
         todo = storage.open_blocks()
         _ = xr.Dataset  # loaded now: an interrupt should not wait for that
         done = blocks.total - sum(map(_size_of, todo))
@@ -351,7 +350,6 @@ def scan(
     max_impacts: int = 1000,
     max_steps: int | None = None,
     store: str | Path | None = None,
-    tag: str = "",
     lanes: int | None = None,
     workers: int | None = None,
     devices: int | None = None,
@@ -386,9 +384,7 @@ def scan(
       `data.attrs` then has the number of different lanes (`verified_changed_period`, for integers)
       or the 95 % quantile of the error (`verified_error_y_min`; infinite if one failed).
     - `store`: the folder of a Zarr store, written block by block. The same call resumes it and
-      computes lost blocks again. A changed call is refused, with the difference, and so is another
-      source of your functions and classes.
-    - `tag`: a name for the version of the code that these call, which a store compares, too.
+      computes lost blocks again. A changed call (or code of yours) is refused, with the difference.
     - `lanes`: lanes in a block (a multiple of 256); memory grows with it and with `cycles`.
     - `workers`, `devices`: blocks computed at once on a CPU (by default one per core), and local
       devices over which a block is spread (all by default).
@@ -406,7 +402,6 @@ def scan(
     progress, paired = flag("progress", progress), flag("paired", paired)
     if store is not None:
         instance_of("store", store, (str, Path), "a path")
-    instance_of("tag", tag, str, "a name for the version of your code")
     sizes = [x.size for x in grid.values()]
     if paired and len({*sizes}) != 1:
         raise ValueError(
@@ -421,7 +416,7 @@ def scan(
     program = make(options, derivatives=derivatives)
     place = workplace(workers, devices, cluster)
     blocks = in_blocks(program, grid, place, paired, store, lanes)
-    data = computed(program, blocks, place, store, progress, tag)
+    data = computed(program, blocks, place, store, progress)
     if verify:
         better = make(dataclasses.replace(options, method=_finer_method(program)))
         data.attrs |= _verified(data, blocks, verify, better, place, store)

@@ -63,12 +63,10 @@ class Variable(NamedTuple):
 
 
 class MemoryStore:
-    def __init__(
-        self, program: ScanProgram, blocks: Blocks, variables: Mapping[str, Variable], tag: str
-    ):
+    def __init__(self, program: ScanProgram, blocks: Blocks, variables: Mapping[str, Variable]):
         self.program, self.blocks, self.variables = program, blocks, variables
         # In the form read from a file.
-        self.about = json.loads(json.dumps({"tag": tag} | _description_of(program, blocks)))
+        self.about = json.loads(json.dumps(_description_of(program, blocks)))
         self.arrays: Mapping[str, Any] = self._opened()
 
     def _opened(self) -> Mapping[str, Any]:
@@ -266,16 +264,16 @@ def _create_store(
                 raise  # else another scan made it in the meantime
 
 
-def opened(program: ScanProgram, blocks: Blocks, path: str | Path | None, tag: str) -> MemoryStore:
+def opened(program: ScanProgram, blocks: Blocks, path: str | Path | None) -> MemoryStore:
     """Return the storage of a scan: a Zarr store, or memory without a path."""
     variables = _variables_of(program, blocks)
     per_lane = sum(math.prod(v.sizes) * v.dtype.itemsize for v in variables.values())
     in_memory = blocks.total * per_lane if path is None else blocks.total + 500 * len(blocks)
     fits_memory("axes", in_memory)
     if path is None:
-        return MemoryStore(program, blocks, variables, tag)
+        return MemoryStore(program, blocks, variables)
     _check_writable(path)
-    return ZarrStore(path, program, blocks, variables, tag)
+    return ZarrStore(path, program, blocks, variables)
 
 
 def _check_writable(path: str | Path) -> None:
@@ -312,11 +310,10 @@ def _refuse_another_scan(
             f"{old}, and now it is {now}."
         )
     for what, code in wanted["code of"].items():
-        if not new and code.startswith(UNVERIFIABLE) and not wanted["tag"]:
+        if not new and code.startswith(UNVERIFIABLE):
             raise ValueError(
                 f"Argument `store` must be new, since it is unknown whether the {what} is the "
-                f"same as that in {path}: {code}. Define its functions and classes in a file, or "
-                "name their version by `tag`."
+                f"same as that in {path}: {code}. Define its functions and classes in a file."
             )
 
 
@@ -371,13 +368,14 @@ def _cleaned(text: str) -> str:
 
 
 def _codes(program: ScanProgram) -> dict[str, str]:
+    """Return digests of the user's own functions and classes."""
     parts: dict[str, Any] = {"machine": program.machine if program.build is None else program.build}
     parts |= {"start": program.start, "method": program.method}
     if program.lane_noise is not None and program.lane_noise.noise.functions:
         parts["noise"] = program.lane_noise.noise.functions
     for i, measure in enumerate(program.measures):
         parts[f"measure {i + 1}"] = measure
-    return {name: source_of(part) for name, part in parts.items()}
+    return {name: identity(part) for name, part in parts.items()}
 
 
 # Packages whose code does not change during a study; it is identified by name.
@@ -386,47 +384,113 @@ _LIBRARIES = {
     "lineax", "jaxtyping", "beartype", "xarray", "matplotlib", *sys.stdlib_module_names,
 }  # fmt: skip
 
+# Members of a class that its author did not write.
+_GENERATED = (types.GetSetDescriptorType, types.MemberDescriptorType, types.WrapperDescriptorType)
 
-_NUMBER = int | float | complex | str | bytes
 
-
-def source_of(thing: Any) -> str:
-    """Return a digest of the source of a function, with the numbers that it closes over, or of the
-    classes of an object and the functions among its parts; those of libraries count by name. What
-    they call does not count: a `tag` names its version. Without a source the result begins with
-    `UNVERIFIABLE`."""
+def identity(thing: object) -> str:
+    """Return a digest of a function or an object, from its source code and its content: defaults,
+    variables that it closes over, globals and members of modules that it names, class and
+    attributes. Functions and classes among them count too, unless they are a library's. If
+    something has neither source nor content, the result begins with `UNVERIFIABLE` and names it."""
     digest = hashlib.sha256()
     try:
-        for kind in _kinds_of(thing):
-            is_library = (kind.__module__ or "").partition(".")[0] in _LIBRARIES
-            digest.update((kind.__qualname__ if is_library else _source(kind)).encode())
-    except (OSError, TypeError) as error:
+        for word in _words(thing, {}):
+            digest.update(word.encode("utf-8", "backslashreplace") + b"\0")
+    except (OSError, TypeError, RecursionError) as error:
         return f"{UNVERIFIABLE}{error}"
     return digest.hexdigest()[:16]
 
 
-def _source(kind: Any) -> str:
-    if inspect.getfile(kind) == "<string>":  # Python 3.13 names the source of `python -c` so
-        raise OSError("it was made by `exec`")
-    closed = inspect.getclosurevars(kind).nonlocals if inspect.isfunction(kind) else {}
-    plain = {n: x for n, x in closed.items() if isinstance(x, _NUMBER)}
-    return f"{inspect.getsource(kind)}{plain}"
+def _words(thing: Any, visited: dict[int, Any]) -> Iterator[str]:
+    """Yield the words that describe `thing`. Visited objects are in `visited`: references may form
+    cycles."""
+    if thing is None or isinstance(thing, int | float | complex | str | bytes | np.dtype):
+        yield repr(thing)
+    elif isinstance(thing, np.ndarray | np.generic | jax.Array):
+        array = np.asarray(thing)
+        yield f"{array.dtype} {array.shape} {hashlib.sha256(array.tobytes()).hexdigest()}"
+    elif isinstance(thing, types.ModuleType):
+        yield thing.__name__
+    elif id(thing) in visited:
+        yield str(list(visited).index(id(thing)))
+    else:
+        visited[id(thing)] = thing
+        yield type(thing).__qualname__
+        for part in _parts(inspect.unwrap(thing) if callable(thing) else thing):
+            yield from _words(part, visited)
 
 
-def _kinds_of(thing: Any) -> Iterator[Any]:
-    """Yield the functions and classes of an object and of its parts, whatever wraps them."""
+def _parts(thing: Any) -> list[Any]:
+    """Return the parts of an object. **Raises:** `OSError` or `TypeError` for one without any."""
+    if isinstance(thing, set | frozenset):
+        return sorted(map(identity, thing))
+    if isinstance(thing, list | tuple):
+        return list(thing)
+    if isinstance(thing, Mapping):
+        return [x for pair in thing.items() for x in pair]
     if isinstance(thing, functools.partial):
-        thing = thing.func
-    thing = inspect.unwrap(thing) if callable(thing) else thing
-    if isinstance(thing, list | tuple | Mapping):
-        for part in thing.values() if isinstance(thing, Mapping) else thing:
-            yield from _kinds_of(part)
-    elif isinstance(thing, types.FunctionType):
-        yield thing
-    elif not isinstance(thing, _NUMBER | jax.Array | np.ndarray | np.generic | None):
-        yield from (thing if isinstance(thing, type) else type(thing)).__mro__
-        parts = vars(thing) if isinstance(thing, eqx.Module) else {}
-        yield from _kinds_of(list(parts.values()))
+        return [thing.func, thing.args, thing.keywords]
+    if isinstance(thing, types.MethodType):
+        return [thing.__func__, thing.__self__]
+    if isinstance(thing, types.BuiltinFunctionType | np.ufunc):
+        return [thing.__name__]
+    if isinstance(thing, property):
+        return [thing.fget]
+    if isinstance(thing, type | types.FunctionType):
+        name, is_users = [thing.__module__, thing.__qualname__], _is_users(thing.__module__)
+        if isinstance(thing, type):
+            return [*name, *thing.__bases__, *_members(thing)] if is_users else name
+        nonlocals = inspect.getclosurevars(thing).nonlocals
+        if not is_users:
+            return [*name, nonlocals]
+        if inspect.getfile(thing) == "<string>":  # Python 3.13 names the source of `python -c` so
+            raise OSError("it was made by `exec`")
+        source = inspect.getsource(thing)
+        named = _named(thing.__code__)
+        known = {n: thing.__globals__[n] for n in sorted(named) if n in thing.__globals__}
+        known |= {n: sys.modules[n] for n in sorted(named - {*known}) if n in sys.modules}
+        modules = [
+            x for x in (*known.values(), *nonlocals.values()) if isinstance(x, types.ModuleType)
+        ]
+        inside = list(_members_of_modules(modules, named))
+        return [source, thing.__defaults__, thing.__kwdefaults__, nonlocals, known, inside]
+    return [type(thing), *thing.__reduce_ex__(2)[1:3]]
+
+
+def _is_users(module: str | None) -> bool:
+    return (module or "").partition(".")[0] not in _LIBRARIES
+
+
+def _named(code: types.CodeType) -> set[str]:
+    """Return the names that a function reads, of globals, modules and attributes, also within the
+    functions that it defines."""
+    inner = (x for x in code.co_consts if isinstance(x, types.CodeType))
+    return {*code.co_names}.union(*map(_named, inner))
+
+
+def _members_of_modules(modules: list[types.ModuleType], named: set[str]) -> Iterator[Any]:
+    """Yield the members that a function may read from a user's modules, with their names."""
+    modules, visited = list(modules), set[int]()
+    for module in modules:  # grows
+        if not _is_users(module.__name__) or id(module) in visited:
+            continue
+        visited.add(id(module))
+        for name in sorted(named & {*vars(module)}):
+            member = getattr(module, name)
+            if isinstance(member, types.ModuleType):
+                modules.append(member)
+            yield from (f"{module.__name__}.{name}", member)
+
+
+def _members(kind: type) -> Iterator[Any]:
+    """Yield the methods and plain values that the author of a class wrote, with their names."""
+    for name, value in sorted(vars(kind).items()):
+        code = getattr(inspect.unwrap(value) if callable(value) else value, "__code__", None)
+        is_generated = isinstance(value, _GENERATED) or (code and code.co_filename == "<string>")
+        is_plain = isinstance(value, int | float | complex | str | bytes) and name[:2] != "__"
+        if (hasattr(value, "__get__") and not is_generated) or is_plain:
+            yield from (name, value)
 
 
 def _numbers(tree: Any) -> dict[str, Any]:
