@@ -75,6 +75,7 @@ def crests(
     find = partial(_crest, plan, shares, h)
     stacked = jtu.tree_map(lambda *x: jnp.stack(x), *zip(ends, values, slack, strict=True))
 
+    @jax.jit  # so that its code is written once
     def quick_test(given: Sequence[Any]) -> Flag:
         x, inner, zero = given
         return may_be_above(x[:2], x[2:], inner, shares, zero)

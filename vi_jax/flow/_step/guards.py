@@ -7,6 +7,7 @@ error of their integral over the step is added, and `aim.crests` finds where the
 """
 
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -208,9 +209,10 @@ def may_be_above(
     rises = values[1:] - values[:-1]
     halves = 0.5 * jnp.abs(rises)
     slopes = jnp.concatenate([v0[None], rises, v1[None]])
-    fours = [slopes[n : slopes.size - 3 + n] for n in range(4)]
-    falls = functools.reduce(jnp.maximum, fours) <= 0
-    one_way = falls | (functools.reduce(jnp.minimum, fours) >= 0)
+    fours = [slice(n, slopes.size - 3 + n) for n in range(4)]
+    falling, rising = slopes <= 0, slopes >= 0
+    one_way = functools.reduce(operator.and_, (falling[x] for x in fours))
+    one_way = one_way | functools.reduce(operator.and_, (rising[x] for x in fours))
     top = values[1:-1] + jnp.maximum(halves[1:], halves[:-1]) > zero
     within = jnp.any(top & ~one_way)
     return within | (v0 > 0) & (x0 + halves[0] > zero) | (v1 < 0) & (x1 + halves[-1] > zero)
