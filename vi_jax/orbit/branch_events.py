@@ -56,7 +56,7 @@ from .kinds import (
     TURNS,
     WATCHED,
 )
-from .locate import SPACING, crossing, dip_of
+from .locate import SPACING, crossing, dip_of, passes_zero
 from .results import Orbit
 from .sliding import change_at, locate_change
 from .special import Point, further_of, point_at
@@ -282,12 +282,17 @@ class MotionTable(Table):
     def _zeros(self, here: Step, last: Step) -> Iterator[tuple[Point, Step]]:
         """Yield local extrema of quantities, and zeros of watched functions."""
         known_x, before = self._last_numbers
+        is_first = not before
         before = before if np.array_equal(known_x, here.x) else self._numbers(here)
         self._last_numbers = last.x, self._numbers(last)
         for (kind, name), (value, begin) in before.items():
             other, end = self._last_numbers[1][kind, name]
             steep, least = max(abs(begin), abs(end)), ROUNDING * max(abs(value), abs(other))
-            if not begin * end < 0 or (kind == EXTREMUM and steep <= least):
+            # A zero at the first motion counts on the way on which the function falls.
+            starts_at_zero = is_first and kind == WATCHED and begin == 0 > end
+            if not (starts_at_zero or passes_zero(begin, end)):
+                continue
+            if kind == EXTREMUM and steep <= least:
                 continue
             at = self.locate_zero(here, last, lambda s, k=(kind, name): self._numbers(s)[k][1])
             if at is None:
@@ -478,7 +483,7 @@ def _changed_tests(here: Step, last: Step, *, held: bool) -> list[str]:
     motion are `held`, the two are independent.
     """
     before, after = bifurcation_tests(here), bifurcation_tests(last)
-    changed = [kind for kind in before if before[kind] * after[kind] < 0]
+    changed = [kind for kind in before if passes_zero(before[kind], after[kind])]
     # Without damping a pair stays on the unit circle, to rounding of either sign.
     if TORUS in changed and max(abs(before[TORUS]), abs(after[TORUS])) < ROUNDING:
         changed.remove(TORUS)

@@ -39,7 +39,7 @@ from .kinds import (
     starts,
 )
 from .local_map import graze_at
-from .locate import locate_zero
+from .locate import locate_zero, passes_zero
 from .results import Orbit
 from .sliding import change_at, without_part
 from .special import Point, point_at
@@ -317,7 +317,7 @@ def _locate_change(two: Shooting, x: np.ndarray, distance: float, test: str) -> 
     for i, side in itertools.product(range(_STEPS), (0, 1)):
         here = ends[side]
         step = advance(two, here.x, here.tangent, _FIRST * distance * 2**i)
-        if bool(step.good) and value(here) * value(step) < 0:
+        if bool(step.good) and passes_zero(value(here), value(step)):
             return locate_zero(two, here, step, value)
         ends[side] = step if bool(step.good) else here
     return None
