@@ -1,12 +1,14 @@
 """The unit of each component, the section and the order of events do not change orbits and
 branches."""
 
+import functools
+
 import jax
 import numpy as np
 import pytest
 import vi_jax as vi
 
-from own_units import MACHINES, Colliding, Cranked, Pair, Struck, variants
+from own_units import MACHINES, Colliding, Cranked, Cushioned, Pair, Struck, variants
 
 pytestmark = pytest.mark.slow
 
@@ -48,30 +50,34 @@ def test_orbits_in_single_precision(kind):
         assert_same_orbits(kind, 2e-3)
 
 
+@functools.cache
+def branches_of(kind):
+    options = {"parameter": "p", "bounds": kind.bounds, "progress": False}
+    return [
+        (machine, vi.continue_orbit(found_by(machine), **options)) for machine in variants(kind)
+    ]
+
+
 # A multiplier is infinite at a grazing that ends a branch.
 @pytest.mark.parametrize("kind", MACHINES)
 def test_branches(kind):
     first = None
-    for machine in variants(kind):
-        branch = vi.continue_orbit(
-            found_by(machine), parameter="p", bounds=kind.bounds, progress=False
-        )
+    for machine, branch in branches_of(kind):
         found = branch.ends, [(x.kind, round(x.parameter, 8)) for x in branch.special]
         first = first or found
         assert found == first, (machine.scales, machine.phase, machine.is_flipped)
 
 
-@pytest.mark.parametrize("kind", [Struck, Pair, Colliding, Cranked])
+@pytest.mark.parametrize("kind", [Struck, Pair, Colliding, Cranked, Cushioned])
 def test_local_maps(kind):
     first = None
-    for machine in variants(kind):
-        branch = vi.continue_orbit(
-            found_by(machine), parameter="p", bounds=kind.bounds, progress=False
-        )
+    for machine, branch in branches_of(kind):
         point = next(x for x in branch.special if x.kind == "grazing")
         graze = vi.grazing(point, check=False)
         entries = graze.entries / np.abs(graze.entries).max()
         found = graze.touched.split()[0], str(graze.outcome), graze.forecast.period.tolist()
         first = first or (found, entries)
         assert found == first[0], (machine.scales, machine.phase, machine.is_flipped)
-        np.testing.assert_allclose(entries, first[1], rtol=0, atol=1e-6)
+        # The kick of a soft stop is that of brief contacts, in which rounding is larger.
+        atol = 1e-5 if kind is Cushioned else 1e-6
+        np.testing.assert_allclose(entries, first[1], rtol=0, atol=atol)

@@ -171,8 +171,10 @@ def test_watch_locates_the_zero_of_a_function():
         "amplitude": lambda orbit: orbit.y_max - 1.3,
         "begin": lambda orbit: orbit.machine.drive.frequency_ratio - 0.31,
     }
-    begin, point = vi.continue_orbit(orbit, watch=watched, **options).special
+    branch = vi.continue_orbit(orbit, watch=watched, **options)
+    begin, point = branch.special
     assert (begin.quantity, begin.parameter) == ("begin", 0.31)
+    assert len(branch.at(0.31)) == 1 and branch.parameter[begin.index] == 0.31
     amplitude = 1 / np.hypot(1 - point.parameter**2, 0.5 * point.parameter)
     assert (point.kind, point.quantity) == ("watched", "amplitude")
     assert amplitude == pytest.approx(1.3, abs=1e-12)

@@ -84,6 +84,11 @@ class AbstractEvent(Shown):
         `sides(machine, s, state, *modes)`; by default the guard alone."""
         return (self.guard(*args, **kwargs),)
 
+    def guard_into(self, new: Scalar, *args: Any, **kwargs: Any) -> Scalar:
+        """Return the guard of a change into the mode `new`, if the guard is the largest of several
+        functions: that one which is zero at this change. By default return `guard`."""
+        return self.guard(*args, **kwargs)
+
     @abc.abstractmethod
     def after(self, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
         """Return state and modes after the event: `after(machine, s, state, *modes)`."""

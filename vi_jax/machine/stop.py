@@ -500,12 +500,20 @@ class SoftStop(Wall, AbstractSwitch):
         return jnp.where(inside, mode, APART)
 
     def guard(self, machine, s, state, mode):
+        if self.adhesive:
+            return -mode * self.depth(machine, state)[0]
+        to_apart, to_other = (
+            self.guard_into(x, machine, s, state, mode) for x in (APART, TOUCHING)
+        )
+        return jnp.maximum(to_apart, to_other)
+
+    def guard_into(self, new, machine, s, state, mode):
         depth, _ = self.depth(machine, state)
         if self.adhesive:
             return -mode * depth
         pulls = self._pulls(machine, s, state)
         ends = jnp.where(mode > 0, pulls, -pulls)
-        return jnp.where(mode < 0, depth, jnp.maximum(ends, -depth))
+        return jnp.where(mode < 0, depth, jnp.where(new < 0, -depth, ends))
 
     def after(self, machine, s, state, mode):
         if self.adhesive:

@@ -381,10 +381,10 @@ class Shooting(eqx.Module):
     def guard(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
         """Return g(s, u), which is zero and rising at the event that begins a leg."""
 
-        before = self.flight(machine, leg - 1)
+        before, modes = self.flight(machine, leg - 1), self.modes_in(leg)
 
         def value(event, s, u):
-            return guard_at(before, event, s, self.unravel(u))
+            return guard_at(before, event, s, self.unravel(u), modes)
 
         return self._for_event(leg, value, s, u)
 

@@ -167,7 +167,7 @@ def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np
 
 # Touches that are closer than this share of a period are one: the depth between them is then of the
 # order of `LOCATED`. A choice.
-_SEPARATE = 1e-3
+SEPARATE = 1e-3
 
 # Speed of approach, as a share of the motion's, at which rebounds are differentiated: laws that
 # depend on the speed are taken at this one. A choice.
@@ -229,7 +229,7 @@ def find_touches(
             for event, _, known in found
             if event == other
         ]
-        if min(time_differences, default=period) > _SEPARATE * period:
+        if min(time_differences, default=period) > SEPARATE * period:
             found.append((int(other), int(leg), place))
     return found
 
