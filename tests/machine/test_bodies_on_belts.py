@@ -183,9 +183,10 @@ class Three(vi.Mechanical):
         ]
         stop = vi.RigidStop(self.gap, self.restitution, on="b")
         strikes = vi.RigidStop(self.gap, self.restitution, on=lambda q: q.c - q.b)
-        return {"three": rubs, "stop": (*rubs, stop), "bodies": (rubs[0], rubs[2], strikes)}[
-            self.kind
-        ]
+        return {
+            "three": rubs, "stop": (*rubs, stop), "two": (*rubs[:2], stop),
+            "bodies": (rubs[0], rubs[2], strikes),
+        }[self.kind]  # fmt: skip
 
     def force(self, t, q, v):
         drive = self.drive * jnp.cos(2 * self.w * t)
@@ -213,3 +214,41 @@ def test_static_ratios_and_impacts_on_belts(kind):
     )
     assert good and fine
     np.testing.assert_allclose(found, finer, rtol=0, atol=1e-8)
+
+
+class Coupled(Three):
+    """The same with a full mass matrix."""
+
+    off: Any = None
+
+    def mass(self, q):
+        o = self.off
+        return [[1.0, o[0], o[1]], [o[0], 0.8, o[2]], [o[1], o[2], 1.3]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "lane", "expected"),
+    [
+        ("stop", 19, (0.228985331207, 0.162989054632, 0.047471110098)),
+        ("two", 240, (0.272481035319, -0.040766497928, -1.571574527273)),
+    ],
+)
+def test_a_body_that_rests_while_others_slip_leaves_its_stop(kind, lane, expected):
+    """Regressions: at rest the sign of a velocity of 1e-13 was taken for the direction of motion.
+    After the release, a turn was sought where none is."""
+    draw, n = np.random.default_rng(1).uniform, 512
+    off = draw(-0.15, 0.15, (n, 3))
+    given = dict(
+        w=draw(0.4, 1.5, n), levels=draw(0.05, 0.9, (n, 3)), ratios=draw(1.0, 1.5, (n, 3)),
+    )  # fmt: skip
+    size, drift = draw(0.05, 0.5, n), draw(-0.3, 0.3, n)
+    given |= dict(
+        drive=draw(0.2, 1.2, n), gap=draw(0.15, 0.6, n), restitution=draw(0.2, 0.9, n), off=off
+    )
+    given["belt"] = np.column_stack([size, drift, draw(0, 2 * np.pi, (n, 5))])
+    given = {name: x[[lane]] for name, x in given.items()}
+    start = dict(a=0.1, b=0.1, c=0.05, v=dict(a=0.2))
+    found, good = ends(functools.partial(Coupled, kind=kind), given, 3, **start)
+    assert good
+    np.testing.assert_allclose(found[0], expected, rtol=0, atol=2e-9)
