@@ -107,3 +107,35 @@ def test_an_event_reaches_the_end_of_a_chatter():
     (point,) = branch.special
     assert point.parameter == pytest.approx(0.5 * np.pi - 0.6 * 1.1788045220098, abs=1e-7)
     assert "(the end of the chatter on the right stop and switch 0, at clock 1.439" in point.detail
+
+
+class Pressed(vi.Mechanical):
+    """A body that a constant force presses on a stop, and a vibration lifts for a part of a cycle
+    if its amplitude is greater."""
+
+    q, mass, cycle = ("x",), (1.0,), 2 * np.pi
+    amplitude: float = 0.6
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(0.0, 0.4, on="x")
+
+    def force(self, t, q, v):
+        return dict(x=0.5 + self.amplitude * jnp.cos(t) - q.x - 0.2 * v.x)
+
+
+@pytest.mark.slow
+def test_a_rest_that_joins_itself():
+    """Regression: the motion beyond was one without rest, which does not exist."""
+    machine = Pressed()
+    settled = vi.simulate(machine, machine.at(x=-0.1), 1, settle=40, rests=True).last
+    orbit = vi.find_orbit(machine, settled, throw=True)
+    options = {"parameter": "amplitude", "bounds": (0.2, 0.7), "progress": False}
+    branch = vi.continue_orbit(orbit, **options)
+    point = next(x for x in branch.special if x.kind == "rest")
+    assert point.parameter == pytest.approx(0.5, abs=1e-6) and "lasts for ever" in point.detail
+    always = vi.continue_orbit(point.switch(), **options)
+    (divided,) = always.special
+    assert set(always.ends) == {"bounds", "rest"} and always.parameter.min() == 0.2
+    assert divided.parameter == pytest.approx(0.5, abs=1e-9)
+    assert int(divided.switch().rests) == 1

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from ..machine import stops_of
 from .conditions import HeldMultiplier, bifurcation_tests, in_one_parameter, rates_at
 from .corrector import Step, advance, distance_along, orbit_of
 from .edit_events import (
@@ -165,7 +166,12 @@ class MotionTable(Table):
         place = place_in_words(self.problem, at, clock)
         detail = f"two rests on a stop become one: the body no longer leaves it {place}"
         old, at = in_one_parameter(self.problem, at)
-        new, x = without_events(old, at.x, both)
+        (number, *_), (new, x) = old.events[release], without_events(old, at.x, both)
+        if all(event.number != number for event in new.events):  # a rest joins itself
+            detail = f"a rest on a stop lasts for ever: the body no longer leaves it {place}"
+            held = list(old.held) or [0.0] * len(old.machine.coordinates)
+            held[stops_of(old.machine)[number].coordinate] = 1.0 + number
+            new = dataclasses.replace(new, held=tuple(held))
         at = advance(new, x, np.eye(x.size)[-1], 0.0)
         return point_at(new, at, REST, detail, is_origin=True)
 
