@@ -51,33 +51,37 @@ def test_orbits_in_single_precision(kind):
 
 
 @functools.cache
-def branches_of(kind):
+def branches(kind):
+    """Return the branch of each variant, and the variant in words."""
     options = {"parameter": "p", "bounds": kind.bounds, "progress": False}
     return [
-        (machine, vi.continue_orbit(found_by(machine), **options)) for machine in variants(kind)
+        (
+            vi.continue_orbit(found_by(machine), **options),
+            f"{machine.scales} {machine.phase} {machine.is_flipped}",
+        )
+        for machine in variants(kind)
     ]
 
 
-# A multiplier is infinite at a grazing that ends a branch.
 @pytest.mark.parametrize("kind", MACHINES)
 def test_branches(kind):
     first = None
-    for machine, branch in branches_of(kind):
+    for branch, case in branches(kind):
         found = branch.ends, [(x.kind, round(x.parameter, 8)) for x in branch.special]
         first = first or found
-        assert found == first, (machine.scales, machine.phase, machine.is_flipped)
+        assert found == first, case
 
 
 @pytest.mark.parametrize("kind", [Struck, Pair, Colliding, Cranked, Cushioned])
 def test_local_maps(kind):
     first = None
-    for machine, branch in branches_of(kind):
+    for branch, case in branches(kind):
         point = next(x for x in branch.special if x.kind == "grazing")
         graze = vi.grazing(point, check=False)
         entries = graze.entries / np.abs(graze.entries).max()
         found = graze.touched.split()[0], str(graze.outcome), graze.forecast.period.tolist()
         first = first or (found, entries)
-        assert found == first[0], (machine.scales, machine.phase, machine.is_flipped)
+        assert found == first[0], case
         # The kick of a soft stop is that of brief contacts, in which rounding is larger.
         atol = 1e-5 if kind is Cushioned else 1e-6
         np.testing.assert_allclose(entries, first[1], rtol=0, atol=atol)

@@ -19,8 +19,8 @@ from .edit_events import with_least_period, with_sections, without_events
 from .equations import Shooting
 from .kinds import with_article
 from .special import Point
-from .tolerances import LOCATED
-from .touch import SEPARATE, NoLocalMapError, Touch, find_touches, touch_at
+from .tolerances import BRIEF, LOCATED
+from .touch import NoLocalMapError, Touch, find_touches, touch_at
 
 
 class LocalMap(eqx.Module):
@@ -170,7 +170,7 @@ def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
 def _changes_at_once(problem: Shooting, x: np.ndarray, i: int) -> set[int]:
     """Return the events that coincide with event `i`, of the same switch: all of a brief contact,
     of which the release may come before the end."""
-    is_brief = problem.lengths(x) < SEPARATE * float(problem.period(x))
+    is_brief = problem.lengths(x) < BRIEF * problem.radian
     found = {i}
     for step, leg in ((1, 0), (-1, -1)):
         j = i

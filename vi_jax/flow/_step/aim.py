@@ -27,7 +27,8 @@ from .trial import Path, Trial
 _BRIEF = 1e-3
 
 # The polynomial of a guard is evaluated at the ends of this many parts of the step. It is corrected
-# by stages that are no closer to its ends than this share. Choices.
+# by stages that are no closer to its ends than this share. Choices; the 15 heights between the ends
+# fit in a kernel's registers, without which a friction takes a fifth longer.
 _PARTS = 16
 _EDGE = 0.1
 
@@ -74,6 +75,7 @@ def crests(
     find = partial(_crest, plan, shares, h)
     stacked = jtu.tree_map(lambda *x: jnp.stack(x), *zip(ends, values, slack, strict=True))
 
+    @jax.jit  # so that its code is written once
     def quick_test(given: Sequence[Any]) -> Flag:
         x, inner, zero = given
         return may_be_above(x[:2], x[2:], inner, shares, zero)
@@ -106,7 +108,7 @@ def _crest(
     factor's greatest change from stage to stage is a margin."""
     x0, v0, x1, v1 = ends
     height0, rises, height1, falls = x0 - slack, h * v0, x1 - slack, h * v1
-    grid, inner = np.arange(_PARTS + 1) / _PARTS, _inner(shares)
+    grid, inner = np.arange(1, _PARTS) / _PARTS, _inner(shares)
 
     def cubic(theta: np.ndarray) -> Array:
         left = 1 - theta
@@ -123,7 +125,8 @@ def _crest(
         share = np.interp(grid, places, np.arange(len(inner))) - left
         margin = jnp.max(jnp.abs(err[1:] - err[:-1])) if len(inner) > 1 else jnp.abs(err[0])
         heights = heights + _bump(grid) * (err[left] + share * (err[right] - err[left]) + margin)
-    above, place = _first_top(heights, rises / _PARTS, falls / _PARTS)
+    ends = (height0, rises / _PARTS), (height1, falls / _PARTS)
+    above, place = _first_top(heights, *ends)
     first = jnp.min(jnp.where(values > slack, np.asarray(shares), 2.0))
     place = jnp.maximum(jnp.minimum(place, first), _BRIEF)
     return (above | (first < 1)) & _may_be_shortened(plan, h), place * h
@@ -142,15 +145,19 @@ def _inner(shares: tuple[float, ...]) -> list[int]:
     return [found[share] for share in sorted(found)]
 
 
-def _first_top(heights: Array, rise: Scalar, fall: Scalar) -> tuple[Flag, Scalar]:
+def _first_top(
+    heights: Array, begin: tuple[Scalar, Scalar], end: tuple[Scalar, Scalar]
+) -> tuple[Flag, Scalar]:
     """Return whether a curve is positive between its ends, and the first such place as a share. The
-    curve consists of parabolas through its heights at equal distances, ends included, and through
-    the slopes `rise` and `fall` at the ends, per distance."""
-    parts = heights.size - 1
-    before, here, after = heights[:-2], heights[1:-1], heights[2:]
-    bend, tilt = 2 * here - before - after, after - before
-    top = (here >= before) & (here >= after) & (bend > 0)
-    found = (here > 0) | top & (tilt * tilt > -8 * bend * here)
+    curve consists of parabolas through its heights at equal distances, between the ends and at
+    them, and through the slopes at the ends, per distance; `begin` and `end` are height and slope.
+    """
+    parts, (first, rise), (last, fall) = heights.size + 1, begin, end
+    before = jnp.concatenate([first[None], heights[:-1]])
+    after = jnp.concatenate([heights[1:], last[None]])
+    bend, tilt = 2 * heights - before - after, after - before
+    top = (heights >= before) & (heights >= after) & (bend > 0)
+    found = (heights > 0) | top & (tilt * tilt > -8 * bend * heights)
     at = np.arange(1, parts) + jnp.where(top, 0.5 * tilt / jnp.where(top, bend, 1.0), 0.0)
     place = jnp.min(jnp.where(found, at, parts + 1.0))
 
@@ -159,9 +166,9 @@ def _first_top(heights: Array, rise: Scalar, fall: Scalar) -> tuple[Flag, Scalar
         found = (slope > 0) & (slope < 2 * bend) & (slope * slope > -4 * bend * height)
         return jnp.where(found, slope / jnp.where(found, 2 * bend, 1.0), parts + 1.0)
 
-    place = jnp.minimum(place, top_near_end(heights[0], rise, heights[1]))
-    last = top_near_end(heights[-1], -fall, heights[-2])
-    place = jnp.minimum(place, jnp.where(last < parts, parts - last, parts + 1.0))
+    place = jnp.minimum(place, top_near_end(first, rise, heights[0]))
+    late = top_near_end(last, -fall, heights[-1])
+    place = jnp.minimum(place, jnp.where(late < parts, parts - late, parts + 1.0))
     return place < parts, place / parts
 
 
@@ -173,41 +180,42 @@ def _bump(share: np.ndarray) -> np.ndarray:
 def may_turn_twice(plan: Plan, direction: Scalar, path: Path, h: Scalar) -> Flag:
     """Return whether the velocity, of one sign at both ends, may have been zero in between. Then
     the step is halved, until each step has one turning point or the dip is too short to matter. The
-    rates of the force, if known, show whether it sags; else it counts as linear."""
+    rates of the force show whether it sags; where they are unknown, it counts as linear."""
     begin, end = path.begin, path.end
     a0, a1 = direction * begin.a, direction * end.a
     dips = (a0 < 0) & (a1 > 0) & (h > plan.in_units(_SHORTEST_DIP))
-    if path.force_rates is None:
-        # lowest < 0.1 (v0 + v1), times a1 - a0: without a division in each step.
-        room = direction * (begin.v - 0.1 * (begin.v + end.v))
-        return dips & (room * (a1 - a0) < 0.5 * h * a0 * a0)
-    drop = 0.5 * h * a0 * (a0 / jnp.where(dips, a0 - a1, 1.0))
-    j0, j1 = direction * path.force_rates[0], direction * path.force_rates[1]
+    # lowest < 0.1 (v0 + v1), times a1 - a0: without a division in each step.
+    room = direction * (begin.v - 0.1 * (begin.v + end.v))
+    linear = dips & (room * (a1 - a0) < 0.5 * h * a0 * a0)
+    if path.near is None:
+        return linear
+    j0, j1 = direction * path.near.begin, direction * path.near.end
     sags = dips & (j0 * h < a1 - a0) & (a1 - a0 < j1 * h)
-    corner, low, _ = _corner((a0, j0), (a1, j1), h, sags)
-    deep = 0.5 * corner * (a0 + low) - 0.5 * low * low / jnp.where(sags, j1, 1.0)
-    flat = -0.5 * a0 * a0 / jnp.where(sags & (low >= 0), j0, 1.0)
-    drop = jnp.where(sags, jnp.where(low < 0, deep, flat), drop)
-    lowest = direction * begin.v + drop
-    return dips & (lowest < 0.1 * direction * (begin.v + end.v))
+
+    def sagging(_: object) -> Flag:
+        corner, low, _ = _corner((a0, j0), (a1, j1), h, sags)
+        deep = 0.5 * corner * (a0 + low) - 0.5 * low * low / jnp.where(sags, j1, 1.0)
+        flat = -0.5 * a0 * a0 / jnp.where(sags & (low >= 0), j0, 1.0)
+        return jnp.where(low < 0, deep, flat) < -room
+
+    return jax.lax.cond(sags, sagging, lambda _: linear, None)
 
 
 def force_may_turn(lane: Lane, k: int, path: Path, h: Scalar) -> tuple[Flag, Scalar]:
     """Return whether the force, of one sign at both ends, may have changed sign in between for a
     body slow enough to be affected, and the place of its extremum. Such a force releases a body at
     rest for a moment, or turns a body twice that has just left the stop."""
-    assert path.force_rates is not None
-    begin, end, (rate0, rate1, brief) = path.begin, path.end, path.force_rates
+    assert path.near is not None and lane.contact is not None
+    begin, end, (_, rate0, rate1, brief) = path.begin, path.end, path.near
     a0, a1 = begin.a, end.a
     bent = rate0 * rate1 < 0
     _, bound, place = _corner((a0, rate0), (a1, rate1), h, bent)
     turns = bent & (place > brief) & (h - place > brief)
     hidden = turns & (a0 * a1 >= 0) & (bound * (a0 + a1) < 0)
-    if lane.contact is not None:
-        # The step may begin at rest, to rounding, where the window of force begins.
-        direction = lane.direction[k]
-        pressed = (lane.contact[k] > 0) & (direction * a1 >= 0) & (direction * bound < 0)
-        hidden = hidden | (turns & pressed)
+    # The step may begin at rest, to rounding, where the window of force begins.
+    direction = lane.direction[k]
+    pressed = (lane.contact[k] > 0) & (direction * a1 >= 0) & (direction * bound < 0)
+    hidden = hidden | (turns & pressed)
     largest = jnp.maximum(jnp.maximum(jnp.abs(a0), jnp.abs(a1)), jnp.abs(bound))
     slow = jnp.minimum(jnp.abs(begin.v), jnp.abs(end.v)) <= largest * h
     return hidden & slow, place
@@ -456,16 +464,18 @@ class _Found(NamedTuple):
     rises: list[tuple[Flag, Scalar]]
     """The same for guards that were evaluated at stages and for forces on resting bodies, also
     before an event on which the step landed."""
+    windows: dict[int, tuple[Flag, Scalar]]
+    """The same for the force on each coordinate that can rest (`force_may_turn`)."""
     twice: Flag
     """True if a motion may have turned twice."""
 
 
 def _may_have_met(plan: Plan, lane: Lane, trial: Trial, found: _Found, foreseen: bool) -> Flag:
     """Return whether a step may have met anything; if not, `_next_goal` need not be evaluated."""
-    if any(path.release is not None for path in trial.paths):
-        always = jnp.ones_like(trial.good)
-        return always if trial.clear is None else ~trial.clear
     met = trial.good & ((lane.target != FREE) & ~is_at_turn(trial) | found.twice)
+    for k, path in enumerate(trial.paths):
+        if path.near is not None:
+            met = met | found.windows[k][0] | path.near.release.left
     for crossing, over, _ in found.guards:
         met = met | over & ~crossing.landed | crossing.again
     for above, _ in (*found.humps, *found.rises):
@@ -507,14 +517,13 @@ def _next_goal(plan: Plan, lane: Lane, trial: Trial, found: _Found) -> tuple[Fla
     nothing_else = trial.good & ~(first.crossed | first.turned | met)
     goal = goal.cut(found.twice & nothing_else, 0.5 * h)
     for k, path in enumerate(trial.paths):
-        if path.force_rates is not None:
+        if path.near is not None:
             # An event may have come before the one that was met: step to the force's extremum.
-            hidden, place = force_may_turn(lane, k, path, h)
-            goal = goal.cut(trial.good & hidden & ~met, place)
-        if path.release is not None:
-            left, place, released = path.release.left, path.release.place, path.release.landed
+            hidden, place = found.windows[k]
+            goal = goal.cut(hidden & ~met, place)
+            left, landed, place, _ = path.near.release
             goal = _Goal(
-                event=goal.event & ~released | left,
+                event=goal.event & ~landed | left,
                 before=goal.before & ~left,
                 length=jnp.where(left, place, goal.length),
                 target=jnp.where(left, to_release(k), goal.target),
@@ -526,7 +535,7 @@ def _next_goal(plan: Plan, lane: Lane, trial: Trial, found: _Found) -> tuple[Fla
 
 def _find_events(plan: Plan, lane: Lane, trial: Trial) -> _Found:
     h, good, guards, turns, humps = trial.h, trial.good, [], [], []
-    sides, below = [], []
+    sides, below, windows = [], [], {}
     for c in trial.crossings:
         guards.append((c, good & beyond(c), partial(quintic, c.begin, c.end, h)))
         if c.event.holds_mode:
@@ -539,11 +548,13 @@ def _find_events(plan: Plan, lane: Lane, trial: Trial) -> _Found:
     stops_exact, twice = stops_are_exact(plan.machine, lane.state), jnp.zeros_like(good)
     eps = float(jnp.finfo(h.dtype).eps)
     for k, path in enumerate(trial.paths):
-        if path.pull is not None and path.release is not None:
-            sides.append(path.pull)
-            stays_below = (path.pull.end.x <= 0) | path.release.landed
-            asked = stays_below if path.pull.is_used is None else stays_below & path.pull.is_used
-            below.append(~path.release.left & asked)
+        if path.near is not None:
+            left, landed, _, _ = path.near.release
+            hidden, place = force_may_turn(lane, k, path, h)
+            windows[k] = good & hidden, place
+            if path.pull is not None and path.pull.is_used is not None:
+                sides.append(path.pull)
+                below.append(~left & ((path.pull.end.x <= 0) | landed) & path.pull.is_used)
         end, twice = path.end, twice | may_turn_twice(plan, lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
         if lane.contact is not None:  # at rest a velocity is the error of the landing
@@ -561,7 +572,7 @@ def _find_events(plan: Plan, lane: Lane, trial: Trial) -> _Found:
         below = [good & x for x in below]
         found = crests(plan, sides, below, trial.shares, h)
         rises = [(x & y, at) for (x, at), y in zip(found, below, strict=True)]
-    return _Found(guards, turns, humps, rises, twice)
+    return _Found(guards, turns, humps, rises, windows, twice)
 
 
 def _by_newton(lane: Lane, trial: Trial, goal: _Goal) -> _Goal:
