@@ -125,8 +125,8 @@ def _crest(
         share = np.interp(grid, places, np.arange(len(inner))) - left
         margin = jnp.max(jnp.abs(err[1:] - err[:-1])) if len(inner) > 1 else jnp.abs(err[0])
         heights = heights + _bump(grid) * (err[left] + share * (err[right] - err[left]) + margin)
-    ends = (height0, rises / _PARTS), (height1, falls / _PARTS)
-    above, place = _first_top(heights, *ends)
+    begin, end = (height0, rises / _PARTS), (height1, falls / _PARTS)
+    above, place = _first_top(heights, begin, end)
     first = jnp.min(jnp.where(values > slack, np.asarray(shares), 2.0))
     place = jnp.maximum(jnp.minimum(place, first), _BRIEF)
     return (above | (first < 1)) & _may_be_shortened(plan, h), place * h
