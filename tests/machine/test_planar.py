@@ -164,6 +164,22 @@ def test_a_rod_that_slides_into_the_ground_jams():
     assert bool((gain[~jams] < 1e-12).all())
 
 
+def test_a_rod_that_bounces_to_rest_sticks_at_once():
+    """Its last bounces are summed up, and in their time the tip gets a slip of second order."""
+
+    def one(mu, restitution):
+        rod = Rod(mu=mu, restitution=restitution, cycle=0.3)
+        start = rod.sliding(1.2, -1.0, -2.0)
+        run = vi.simulate(rod, start.replace(y=start.y + 0.01), 1, event_log=80, max_impacts=200)
+        return run.successful, run.event_log
+
+    good, log = jax.jit(jax.vmap(one))(*jnp.array([(0.8, 0.3), (0.8, 0.6), (1.6, 0.3)]).T)
+    kind, phase = np.asarray(log.kind)[:, 0], np.asarray(log.phase)[:, 0]
+    rest, mode = (kind == vi.EVENTS.index(x) for x in ("rest", "mode"))
+    assert bool(good.all()) and (rest.sum(1) == 1).all()
+    assert not (mode & (np.abs(phase - phase[rest][:, None]) < 1e-6)).any()
+
+
 @pytest.mark.slow
 def test_two_corners_hold_a_block_together(blocks):
     """The corners have linearly dependent tangents, so their forces are not unique. With friction
