@@ -1,6 +1,8 @@
 """Planar bodies with corners on a floor: blocks that slide, tip, land and bounce, and Painlevé's
 rod. Numbers of blocks are closed forms, or follow from the linear complementarity problem."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -220,6 +222,47 @@ def test_tall_blocks_rock_to_rest():
     # rest are summed up, with an error of second order in the time that they take.
     assert bool((slid > -1e-8).all())
     np.testing.assert_allclose(slid[:4], 0.0, atol=1e-8)
+
+
+class Feet(Block):
+    """A body with feet at these places, on a floor that is shaken."""
+
+    feet: tuple = (-0.2, 0.2)
+    size: Any = 3.0
+    cycle = 0.5
+
+    @property
+    def contacts(self):
+        h, found = self.half_height, []
+        for place in self.feet:
+            height = lambda q, b=place: q.y + b * jnp.sin(q.tilt) - h * jnp.cos(q.tilt)
+            along = lambda q, b=place: q.x + b * jnp.cos(q.tilt) + h * jnp.sin(q.tilt)
+            rubs = dict(friction=self.mu, along=along)
+            found.append(vi.RigidStop(0.0, 0.0, "left", on=height, **rubs))
+        return tuple(found)
+
+    def force(self, t, q, v):
+        return dict(x=self.size * jnp.sin(4 * jnp.pi * t), y=-9.81, tilt=0.0)
+
+
+@pytest.mark.slow
+def test_a_third_foot_between_two_changes_nothing():
+    """The load moves from one side of the middle foot to the other, and the body slides or tips:
+    two feet carry it at a time, and a third one takes over."""
+
+    def one(mu, size, places):
+        body = Feet(mu=mu, size=size, feet=places)
+        run = vi.simulate(body, body.at(y=0.5), 2)
+        last = run.last
+        return run.successful, jnp.stack([last.x, last.y, last.tilt, last.v.x, last.v.tilt])
+
+    cases = jnp.array([(0.2, 3.0), (0.9, 3.0), (0.45, 5.0), (0.9, 6.0)]).T
+    many = lambda places: jax.jit(jax.vmap(lambda *x: one(*x, places)))(*cases)
+    (two, expected), (three, found) = many((-0.2, 0.2)), many((-0.2, 0.05, 0.2))
+    assert bool(two.all()) and bool(three.all())
+    np.testing.assert_allclose(found[:2], expected[:2], atol=1e-12)
+    # After landings on two feet in turn, which are summed up.
+    np.testing.assert_allclose(found[2:], expected[2:], atol=2e-6)
 
 
 class Shaken(Block):

@@ -60,7 +60,7 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
         if has_contact_friction(machine) or (stops_of(machine) and holds_anywhere(machine)):
             modes = struck_modes(machine, s, start, modes, contact=contact)
         if is_compound(machine):
-            contact = pressed_contacts(machine, s, start, modes, contact)
+            contact = pressed_contacts(machine, s, start, modes, contact)[1]
     slides = any(x.blends for x in switches_of(machine))
     if slides or holds_anywhere(machine) or has_contact_friction(machine):
         start = on_held_surfaces(machine, s, start, modes, contact or ())

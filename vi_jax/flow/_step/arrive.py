@@ -50,6 +50,11 @@ from .trial import AppliedStep, Release, Trial
 _ROUNDS = 4
 
 
+# Which contacts take over from one that opens is seen this much later (for a cycle of about 2π): a
+# choice, so that forces differ from those at the event by more than the share that opens a contact.
+_SOON = 1e-6
+
+
 class _DueEvents(NamedTuple):
     """The state of one instant between two of its events, and the events that are due."""
 
@@ -253,25 +258,28 @@ def release_pulled(
     old, modes_before = before
     contacts, direction = list(contact), list(lane.direction)
     together = is_compound(machine)
-    kept = pressed_contacts(machine, s, lane.state, modes, contact) if together else contact
+    kept = contact
+    if together:
+        kept = pressed_contacts(machine, s, lane.state, modes, contact)[1]
     for k in limited_in(machine):
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
             free = hold_contacts(machine, modes, contact, but=k)
             return rates(free.field, machine.coordinates[k], s, state).a
 
-        sign, _ = plan.sign_and_gap(k, contact[k])
+        sign, _ = plan.sign_and_gap(k, jnp.abs(contact[k]))
         if together:
             leaves = kept[k] == 0
+            contacts[k] = jnp.where(when & ~leaves, kept[k], contact[k])
         else:
             pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, lane.state)
             leaves = stop_gradient((pressed >= 0) & (pulled < 0))
-        leaves = when & (contact[k] > 0) & leaves
+        leaves = when & (contact[k] != 0) & leaves
         if contact_before is not None:
-            leaves = leaves & (contact_before[k] == contact[k])
-        clock, stop = plan.clock(lane.s, lane.state), contact[k] - to_event(0)
+            leaves = leaves & (jnp.abs(contact_before[k]) == jnp.abs(contact[k]))
+        clock, stop = plan.clock(lane.s, lane.state), jnp.abs(contact[k]) - to_event(0)
         lane = lane.log_event(taken & leaves, clock, EventKind.release, stop, jnp.nan)
-        contacts[k] = jnp.where(leaves, 0.0, contact[k])
+        contacts[k] = jnp.where(leaves, 0.0, contacts[k])
         direction[k] = jnp.where(leaves, -sign, direction[k])
     return lane._replace(contact=tuple(contacts), direction=tuple(direction))
 
@@ -519,15 +527,25 @@ def _release_body(step: AppliedStep, lane: Lane, k: int, release: Release) -> La
         if not is_affine(plan.machine.coordinates[k].position, state):
             on_stops = _just_inside(plan, k, contact[k], on_stops)
         state = select(contact[k] > 0, on_stops, state)
-    direction = jnp.where(free, -step.old.direction[k], lane.direction[k])
     s, stop = lane.s + jnp.where(free, offset, 0.0), contact[k] - to_event(0)
+    new = with_item(contact, k, jnp.where(free, 0.0, contact[k]))
+    if len(limited_in(plan.machine)) > 1:  # another contact may take over
+        later = stop_gradient(offset + plan.in_units(_SOON))
+        at, soon, _ = flow.extrapolate(later, moving)
+        modes, kept = pressed_contacts(plan.machine, at, soon, lane.modes, new, opened=contact)
+        lane = lane._replace(modes=select(free, constant_modes(modes, s), lane.modes))
+        pairs = zip(kept, contact, strict=True)
+        others = (jnp.where(x == 0, jnp.abs(old), x) for x, old in pairs)
+        new = select(free, with_item(tuple(others), k, kept[k]), contact)
+        free = free & (new[k] == 0)
+    direction = jnp.where(free, -step.old.direction[k], lane.direction[k])
     lane = lane.log_event(step.taken & free, plan.clock(s, state), EventKind.release, stop, jnp.nan)
-    lane = lane.update_record(integrals=select(free, integrals, lane.record.integrals))
+    lane = lane.update_record(integrals=select(release.landed, integrals, lane.record.integrals))
     return lane._replace(
         s=s,
-        state=select(free, state, lane.state),
+        state=select(release.landed, state, lane.state),
         direction=with_item(lane.direction, k, direction),
-        contact=with_item(contact, k, jnp.where(free, 0.0, contact[k])),
+        contact=new,
     )
 
 
@@ -600,8 +618,8 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
         return lane
     rested = () if lane.record.events is None else before.contact or ()
     for k in limited_in(machine) if rested else ():  # an impact on another stop lifts a body
-        old, clock = rested[k], plan.clock(lane.s, lane.state)
-        lifted = step.taken & met & (old > 0) & (contact[k] == 0)
+        old, clock = jnp.abs(rested[k]), plan.clock(lane.s, lane.state)
+        lifted = step.taken & met & (old != 0) & (contact[k] == 0)
         lane = lane.log_event(lifted, clock, EventKind.release, old - to_event(0), jnp.nan)
     # It may release bodies on other stops. A stop may have changed the modes already.
     return release_pulled(plan, lane, step.taken, met, (at_event, before.modes), before.contact)

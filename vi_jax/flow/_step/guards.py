@@ -131,6 +131,8 @@ def inner_guards(
     slow = {k: jnp.zeros((), bool) for k in limited}
     if not plan.method.resolves(machine):
         slow = {k: _is_slow(plan, lane, k, stop_gradient(ends[k]), h) for k in limited}
+        if len(limited) > 1:
+            slow = {k: x & (contacts[k] == 0) for k, x in slow.items()}
 
     def pulls(s: Scalar, state: State) -> dict[int, Scalar]:
         found = {}
@@ -228,7 +230,7 @@ def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -
     beyond = stop.beyond(machine.coordinates[stop.coordinate].position(state))
     if lane.contact is None:
         return beyond
-    return jnp.where(lane.contact[stop.coordinate] > 0, -1.0, beyond)
+    return jnp.where(lane.contact[stop.coordinate] != 0, -1.0, beyond)
 
 
 # Newton's method on a smooth flow needs two or three attempts. If rounding prevents more accuracy,
