@@ -45,21 +45,32 @@ class SmoothMachine(eqx.Module):
     def field(self, s: Scalar, state: State) -> State:
         """Return d(state)/ds, without motion of held bodies."""
         traced = any(isinstance(x, Tracer) for x in jtu.tree_leaves((self, s, state)))
-        field: Any = _traced_once if traced else SmoothMachine.held_field
-        return field(self, s, state)
+        if not traced:
+            return self.held_field(s, state)
+        if not self._holds_one or holds_anywhere(self.machine):
+            return _traced_once(self, s, state)
+        # Held outside of the part that is traced once, so that the free motion shares that part.
+        return self._with_one_held(
+            state, _traced_once(in_modes(self.machine, self.modes), s, state)
+        )
 
     def held_field(self, s: Scalar, state: State) -> State:
         """Return the same as `field`, traced inline."""
-        machine = self.machine
-        flow, dry = field_in(machine, s, state, self.modes), holds_anywhere(machine)
-        if not self.contact and not dry:
-            return flow
-        limited = limited_in(machine) if self.contact else []
-        several = len(limited) > 1 or has_contact_friction(machine)
-        if several or dry:
+        machine, flow = self.machine, field_in(self.machine, s, state, self.modes)
+        if holds_anywhere(machine) or (self.contact and not self._holds_one):
             flow = constrained_rate(machine, flow, s, state, self.modes, self.contact)[0]
-        for k in () if several else limited:  # no rounding if one body rests
-            flow = _without_motion(machine.coordinates[k], state, flow, self.contact[k] > 0)
+        return self._with_one_held(state, flow) if self._holds_one else flow
+
+    @property
+    def _holds_one(self) -> bool:
+        """True if stops may hold one coordinate alone, without friction on them."""
+        several = len(limited_in(self.machine)) > 1 or has_contact_friction(self.machine)
+        return bool(self.contact) and not several
+
+    def _with_one_held(self, state: State, flow: State) -> State:
+        for k in limited_in(self.machine):  # without the rounding of `constrained_rate`
+            coordinate, rests = self.machine.coordinates[k], self.contact[k] > 0
+            flow = _without_motion(coordinate, state, flow, rests)
         return flow
 
 

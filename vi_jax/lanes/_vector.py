@@ -1,6 +1,7 @@
 """Writing a jaxpr of one lane's scalars and small arrays as vector code for a group of lanes."""
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -41,7 +42,7 @@ from ._arrays import (
     write_loops,
 )
 from ._operations import ELEMENTWISE, IDENTITY_PRIMITIVES, kind_of
-from ._program import called, inner, scan_counts, shape_of, size_of
+from ._program import CALLS, called, inner, scan_counts, shape_of, size_of
 from ._text import Text, Value
 
 
@@ -158,10 +159,40 @@ def _needed_equations(jaxpr: Jaxpr) -> list[Any]:
     wanted = {a for a in jaxpr.outvars if not isinstance(a, Literal)}
     kept = []
     for eqn in reversed(jaxpr.eqns):
-        if any(v in wanted for v in eqn.outvars):
+        used = tuple(v in wanted for v in eqn.outvars)
+        if any(used):
+            eqn = eqn if all(used) else _without_unused(eqn, used)
             kept.append(eqn)
             wanted.update(a for a in eqn.invars if not isinstance(a, Literal))
     return kept[::-1]
+
+
+def _without_unused(eqn: Any, used: tuple[bool, ...]) -> Any:
+    """Return a call without the results that are not `used`, and without the arguments that only
+    they need: a derivative of a field is often wanted for one of its numbers. Other equations are
+    returned as they are."""
+    if eqn.primitive.name != "jit":
+        return eqn
+    body, needed = _reduced(eqn.params[CALLS["jit"]], used)
+    return eqn.replace(
+        invars=list(itertools.compress(eqn.invars, needed)),
+        outvars=list(itertools.compress(eqn.outvars, used)),
+        params=eqn.params | {CALLS["jit"]: body},
+    )
+
+
+# The cache keeps a body one object in several calls, so that it can become one function.
+@functools.lru_cache(maxsize=1024)
+def _reduced(closed: ClosedJaxpr, used: tuple[bool, ...]) -> tuple[ClosedJaxpr, tuple[bool, ...]]:
+    """Return a body with its `used` results, and flags of the arguments that these need."""
+    jaxpr = closed.jaxpr
+    outs = list(itertools.compress(jaxpr.outvars, used))
+    eqns = _needed_equations(jaxpr.replace(outvars=outs))
+    atoms = itertools.chain(outs, *(eqn.invars for eqn in eqns))
+    read = {a for a in atoms if not isinstance(a, Literal)}
+    needed = tuple(v in read for v in jaxpr.invars)
+    invars = list(itertools.compress(jaxpr.invars, needed))
+    return closed.replace(jaxpr=jaxpr.replace(invars=invars, outvars=outs, eqns=eqns)), needed
 
 
 def _write_equation(
@@ -271,7 +302,7 @@ class Functions:
             self._count(inner(jaxpr))
 
     def _count(self, jaxpr: Jaxpr) -> None:
-        for eqn in jaxpr.eqns:
+        for eqn in _analysed(jaxpr)[0]:
             body = called(eqn)
             for each in _bodies(eqn) if body is None else [inner(body)]:
                 number = self._calls.get(id(each), 0)
@@ -294,15 +325,19 @@ class Functions:
         found = self._found[key]
         if found is None:
             return None
-        block = t.arena.take(max(found.memory, 1))
-        values = [f"{t.vector(x.kind)} {x.text}" for x in (*_flat(args), mask)]
-        given = ", ".join([f"ptr {Memory(block).pointer(t)}", *values])
-        call = t.raw(f"call fastcc {self._type(t, found.results)} @{found.name}({given})")
+        values = ", ".join(f"{t.vector(x.kind)} {x.text}" for x in (*_flat(args), mask))
+        returned = self._type(t, found.results)
+
+        def written() -> str:
+            block = t.arena.take(max(found.memory, 1))
+            memory = f"ptr {Memory(block).pointer(t)}"
+            return f"call fastcc {returned} @{found.name}({memory}, {values})"
+
+        call = t.call(written, of=f"{found.name}({values})")
         number = iter(range(len(_numbers(found.results))))
 
         def result(kind: str) -> Value:
-            what = f"{self._type(t, found.results)} {call}, {next(number)}"
-            return Value(t.raw(f"extractvalue {what}"), kind)
+            return t.value(f"extractvalue {returned} {call}, {next(number)}", kind)
 
         return [
             Registers.of(shape, kind, lambda _, kind=kind: result(kind))

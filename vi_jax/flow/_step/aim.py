@@ -173,41 +173,42 @@ def _bump(share: np.ndarray) -> np.ndarray:
 def may_turn_twice(plan: Plan, direction: Scalar, path: Path, h: Scalar) -> Flag:
     """Return whether the velocity, of one sign at both ends, may have been zero in between. Then
     the step is halved, until each step has one turning point or the dip is too short to matter. The
-    rates of the force, if known, show whether it sags; else it counts as linear."""
+    rates of the force show whether it sags; where they are unknown, it counts as linear."""
     begin, end = path.begin, path.end
     a0, a1 = direction * begin.a, direction * end.a
     dips = (a0 < 0) & (a1 > 0) & (h > plan.in_units(_SHORTEST_DIP))
-    if path.force_rates is None:
-        # lowest < 0.1 (v0 + v1), times a1 - a0: without a division in each step.
-        room = direction * (begin.v - 0.1 * (begin.v + end.v))
-        return dips & (room * (a1 - a0) < 0.5 * h * a0 * a0)
-    drop = 0.5 * h * a0 * (a0 / jnp.where(dips, a0 - a1, 1.0))
-    j0, j1 = direction * path.force_rates[0], direction * path.force_rates[1]
+    # lowest < 0.1 (v0 + v1), times a1 - a0: without a division in each step.
+    room = direction * (begin.v - 0.1 * (begin.v + end.v))
+    linear = dips & (room * (a1 - a0) < 0.5 * h * a0 * a0)
+    if path.near is None:
+        return linear
+    j0, j1 = direction * path.near.begin, direction * path.near.end
     sags = dips & (j0 * h < a1 - a0) & (a1 - a0 < j1 * h)
-    corner, low, _ = _corner((a0, j0), (a1, j1), h, sags)
-    deep = 0.5 * corner * (a0 + low) - 0.5 * low * low / jnp.where(sags, j1, 1.0)
-    flat = -0.5 * a0 * a0 / jnp.where(sags & (low >= 0), j0, 1.0)
-    drop = jnp.where(sags, jnp.where(low < 0, deep, flat), drop)
-    lowest = direction * begin.v + drop
-    return dips & (lowest < 0.1 * direction * (begin.v + end.v))
+
+    def sagging(_: object) -> Flag:
+        corner, low, _ = _corner((a0, j0), (a1, j1), h, sags)
+        deep = 0.5 * corner * (a0 + low) - 0.5 * low * low / jnp.where(sags, j1, 1.0)
+        flat = -0.5 * a0 * a0 / jnp.where(sags & (low >= 0), j0, 1.0)
+        return jnp.where(low < 0, deep, flat) < -room
+
+    return jax.lax.cond(sags, sagging, lambda _: linear, None)
 
 
 def force_may_turn(lane: Lane, k: int, path: Path, h: Scalar) -> tuple[Flag, Scalar]:
     """Return whether the force, of one sign at both ends, may have changed sign in between for a
     body slow enough to be affected, and the place of its extremum. Such a force releases a body at
     rest for a moment, or turns a body twice that has just left the stop."""
-    assert path.force_rates is not None
-    begin, end, (rate0, rate1, brief) = path.begin, path.end, path.force_rates
+    assert path.near is not None and lane.contact is not None
+    begin, end, (_, rate0, rate1, brief) = path.begin, path.end, path.near
     a0, a1 = begin.a, end.a
     bent = rate0 * rate1 < 0
     _, bound, place = _corner((a0, rate0), (a1, rate1), h, bent)
     turns = bent & (place > brief) & (h - place > brief)
     hidden = turns & (a0 * a1 >= 0) & (bound * (a0 + a1) < 0)
-    if lane.contact is not None:
-        # The step may begin at rest, to rounding, where the window of force begins.
-        direction = lane.direction[k]
-        pressed = (lane.contact[k] > 0) & (direction * a1 >= 0) & (direction * bound < 0)
-        hidden = hidden | (turns & pressed)
+    # The step may begin at rest, to rounding, where the window of force begins.
+    direction = lane.direction[k]
+    pressed = (lane.contact[k] > 0) & (direction * a1 >= 0) & (direction * bound < 0)
+    hidden = hidden | (turns & pressed)
     largest = jnp.maximum(jnp.maximum(jnp.abs(a0), jnp.abs(a1)), jnp.abs(bound))
     slow = jnp.minimum(jnp.abs(begin.v), jnp.abs(end.v)) <= largest * h
     return hidden & slow, place
@@ -456,16 +457,18 @@ class _Found(NamedTuple):
     rises: list[tuple[Flag, Scalar]]
     """The same for guards that were evaluated at stages and for forces on resting bodies, also
     before an event on which the step landed."""
+    windows: dict[int, tuple[Flag, Scalar]]
+    """The same for the force on each coordinate that can rest (`force_may_turn`)."""
     twice: Flag
     """True if a motion may have turned twice."""
 
 
 def _may_have_met(plan: Plan, lane: Lane, trial: Trial, found: _Found, foreseen: bool) -> Flag:
     """Return whether a step may have met anything; if not, `_next_goal` need not be evaluated."""
-    if any(path.release is not None for path in trial.paths):
-        always = jnp.ones_like(trial.good)
-        return always if trial.clear is None else ~trial.clear
     met = trial.good & ((lane.target != FREE) & ~is_at_turn(trial) | found.twice)
+    for k, path in enumerate(trial.paths):
+        if path.near is not None:
+            met = met | found.windows[k][0] | path.near.release.left
     for crossing, over, _ in found.guards:
         met = met | over & ~crossing.landed | crossing.again
     for above, _ in (*found.humps, *found.rises):
@@ -507,14 +510,13 @@ def _next_goal(plan: Plan, lane: Lane, trial: Trial, found: _Found) -> tuple[Fla
     nothing_else = trial.good & ~(first.crossed | first.turned | met)
     goal = goal.cut(found.twice & nothing_else, 0.5 * h)
     for k, path in enumerate(trial.paths):
-        if path.force_rates is not None:
+        if path.near is not None:
             # An event may have come before the one that was met: step to the force's extremum.
-            hidden, place = force_may_turn(lane, k, path, h)
-            goal = goal.cut(trial.good & hidden & ~met, place)
-        if path.release is not None:
-            left, place, released = path.release.left, path.release.place, path.release.landed
+            hidden, place = found.windows[k]
+            goal = goal.cut(hidden & ~met, place)
+            left, landed, place, _ = path.near.release
             goal = _Goal(
-                event=goal.event & ~released | left,
+                event=goal.event & ~landed | left,
                 before=goal.before & ~left,
                 length=jnp.where(left, place, goal.length),
                 target=jnp.where(left, to_release(k), goal.target),
@@ -526,7 +528,7 @@ def _next_goal(plan: Plan, lane: Lane, trial: Trial, found: _Found) -> tuple[Fla
 
 def _find_events(plan: Plan, lane: Lane, trial: Trial) -> _Found:
     h, good, guards, turns, humps = trial.h, trial.good, [], [], []
-    sides, below = [], []
+    sides, below, windows = [], [], {}
     for c in trial.crossings:
         guards.append((c, good & beyond(c), partial(quintic, c.begin, c.end, h)))
         if c.event.holds_mode:
@@ -539,11 +541,13 @@ def _find_events(plan: Plan, lane: Lane, trial: Trial) -> _Found:
     stops_exact, twice = stops_are_exact(plan.machine, lane.state), jnp.zeros_like(good)
     eps = float(jnp.finfo(h.dtype).eps)
     for k, path in enumerate(trial.paths):
-        if path.pull is not None and path.release is not None:
-            sides.append(path.pull)
-            stays_below = (path.pull.end.x <= 0) | path.release.landed
-            asked = stays_below if path.pull.is_used is None else stays_below & path.pull.is_used
-            below.append(~path.release.left & asked)
+        if path.near is not None:
+            left, landed, _, _ = path.near.release
+            hidden, place = force_may_turn(lane, k, path, h)
+            windows[k] = good & hidden, place
+            if path.pull is not None and path.pull.is_used is not None:
+                sides.append(path.pull)
+                below.append(~left & ((path.pull.end.x <= 0) | landed) & path.pull.is_used)
         end, twice = path.end, twice | may_turn_twice(plan, lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
         if not stops_exact or any(x.blends for x in switches_of(plan.machine)):
@@ -559,7 +563,7 @@ def _find_events(plan: Plan, lane: Lane, trial: Trial) -> _Found:
         below = [good & x for x in below]
         found = crests(plan, sides, below, trial.shares, h)
         rises = [(x & y, at) for (x, at), y in zip(found, below, strict=True)]
-    return _Found(guards, turns, humps, rises, twice)
+    return _Found(guards, turns, humps, rises, windows, twice)
 
 
 def _by_newton(lane: Lane, trial: Trial, goal: _Goal) -> _Goal:

@@ -372,7 +372,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
     flow = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.integrals))
     step = AppliedStep(plan, lane, trial, taken, flow)
     if trial.crossings:
-        released = [path.release.landed for path in trial.paths if path.release is not None]
+        released = [path.near.release.landed for path in trial.paths if path.near is not None]
         met = any_of(taken, [*(c.landed for c in trial.crossings), *released])
         # Rare: skipped if no lane of a group has met anything.
         arrived, places = jax.lax.cond(
@@ -439,8 +439,8 @@ def _land(step: AppliedStep, lane: Lane, places: Scalars) -> tuple[Lane, Scalars
         before = tuple(jnp.where(met, plan.machine.position(at_event), Y) for Y in before)
         lane = _apply_event(step, lane, at_event)
     for k, path in enumerate(trial.paths):
-        if path.release is not None:
-            lane = _release_body(step, lane, k, path.release)
+        if path.near is not None:
+            lane = _release_body(step, lane, k, path.near.release)
     places = (plan.machine.position(lane.state), *before)
     # At a switch the field may have an infinite slope (Hertz's damper at first touch). Derivatives
     # are finite along with the event, but not at a fixed clock.

@@ -38,7 +38,7 @@ from ..methods import Stage
 from ..plan import Plan
 from ..sizes import guard_rounding
 from ..smooth import SmoothMachine, is_affine, stops_are_exact
-from .roots import Rates, guard_rates, landing, rates
+from .roots import Field, Rates, guard_rates, landing, rate_of_position, rates
 
 # Places in a step of a motion known in advance where guards are evaluated, as shares of it.
 SHARES = tuple(n / 8 for n in range(1, 8))
@@ -125,9 +125,6 @@ def inner_guards(
     contacts: Any = lane.contact
     checked = events_within_step(plan, lane.state)
 
-    def moves(k: int, s: Scalar, state: State) -> Rates:
-        return rates(free_machines[k].field, machine.coordinates[k], s, state)
-
     slow = {k: jnp.zeros((), bool) for k in limited}
     if not plan.method.resolves(machine):
         slow = {k: _is_slow(plan, lane, k, stop_gradient(ends[k]), h) for k in limited}
@@ -137,9 +134,14 @@ def inner_guards(
     def pulls(s: Scalar, state: State) -> dict[int, Scalar]:
         found = {}
         for k in limited:
-            here, rests = moves(k, s, state), contacts[k] > 0
-            free = jnp.where(slow[k], -lane.direction[k] * here.v, -1.0)
-            found[k] = jnp.where(rests, plan.away(k, contacts[k]) * here.a, free)
+            field, body = free_machines[k].field, machine.coordinates[k]
+            backward = -lane.direction[k] * rate_of_position(field, body, s, state)
+            free = jnp.where(slow[k], backward, -1.0)
+
+            def force(_: Scalar, k: int = k, field: Field = field, body: Any = body) -> Scalar:
+                return plan.away(k, contacts[k]) * rates(field, body, s, state).a
+
+            found[k] = jax.lax.cond(contacts[k] > 0, force, lambda x: x, free)
         return found
 
     def guards(s: Scalar, state: State) -> dict[int, tuple[Scalar, ...]]:
@@ -207,6 +209,30 @@ def may_be_above(
     halves = 0.5 * jnp.abs(values[1:] - values[:-1])
     within = jnp.any(values[1:-1] + jnp.maximum(halves[1:], halves[:-1]) > zero)
     return within | (v0 > 0) & (x0 + halves[0] > zero) | (v1 < 0) & (x1 + halves[-1] > zero)
+
+
+# A force of one sign at both ends of a step may change it in between if in the middle it is less
+# than 0.75 of their mean: a choice. Parabolas that do are below a half of it.
+_SAG = 0.75 / 2
+
+
+def may_turn_between(
+    plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scalar
+) -> Flag:  # fmt: skip
+    """Return whether a body may turn twice within a step, by a quick test: the force goes from
+    against its motion to along it, or sags while the body is slow. If only impacts matter, the body
+    also has to get to a stop in this time."""
+    begin, end = ends
+    total, greater = begin.a + end.a, jnp.maximum(jnp.abs(begin.a), jnp.abs(end.a))
+    slow = jnp.minimum(jnp.abs(begin.v), jnp.abs(end.v)) <= greater * h
+    # The force in the middle, by the quintic through the ends, times h.
+    middle = 1.5 * (end.v - begin.v) - 0.25 * h * total
+    sags = (begin.a * end.a >= 0) & (middle * total <= _SAG * h * total * total)
+    near = plan.meets_turns(lane.done)
+    for stop in (x for x in stops_of(plan.machine) if x.coordinate == k):
+        near = near | _reaches(stop, begin, h) | _reaches(stop, end, h)
+    dips = (lane.direction[k] * begin.a < 0) & (lane.direction[k] * end.a > 0)
+    return dips | slow & sags & near
 
 
 def _is_slow(plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scalar) -> Flag:

@@ -117,7 +117,7 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
 def _jumps(plan: Plan, trial: Trial) -> Flag:
     """Return whether a step ended at an event after which the motion is not smooth."""
     events = [c for c in trial.crossings if c.number != section_number(plan.machine)]
-    released = [path.release.landed for path in trial.paths if path.release is not None]
+    released = [path.near.release.landed for path in trial.paths if path.near is not None]
     return any_of(trial.good, [*(c.landed for c in events), *released])
 
 

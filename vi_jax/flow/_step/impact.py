@@ -44,7 +44,7 @@ from ..plan import Plan
 from ..results import EventKind
 from ..smooth import SmoothMachine, hold_contacts, in_modes, stops_are_exact
 from .event_derivatives import FlowToEvent
-from .roots import force_rate, rates
+from .roots import force_rate, rate_of_position, rates
 from .trial import AppliedStep
 
 # Number of roundings by which a rebound may be faster than the approach: a choice, a few more than
@@ -357,6 +357,10 @@ def _closing(instant: _Instant, x: _Round) -> Array:
 # single precision. Choices: the error is of second order, 6e-11 of that step in double.
 _BRIEF, _BRIEF_SINGLE = 8e-6, 8e-3
 
+# A series of hops that is longer than so many times `_BRIEF` under the force before an impact is no
+# brief one under the force at rest: a choice. A later impact is slower if it is.
+_SURELY_LONGER = 30.0
+
 # A contact is nearly closed at this share of the motion's size: a choice, above the height of hops
 # that take a brief time.
 _NEAR = 1e-6
@@ -373,25 +377,45 @@ def bring_to_rest(
     impacts, `at_event` the state before them, `met` whether there were any."""
     if lane.contact is None:
         return lane
-    if len(impacts) == 1:
-        ((k, impact),) = impacts.items()
-        sign, _ = step.plan.sign_and_gap(k, impact.contact)
-        path, free = step.trial.paths[k], step.trial.free_machines[k]
-        # At the event, not at the step's end: its derivatives include the event's time.
-        body = step.plan.machine.coordinates[k]
-        rate = rates(free.field, body, lane.s, at_event).v
-        speed = impact.share * jnp.maximum(sign * rate, 0.0)
-        growth = None if path.force_rates is None else path.force_rates[1]
-        arguments = k, impact, speed, lane._replace(state=at_event), growth
-        ends, time = _remaining_chatter(step.plan, free, *arguments)
-        rests = {k: pin_flag((impact.contact > 0) & ends, lane.s)}
-        times = {k: time}
-    else:
-        lane = lane._replace(contact=_remaining_contacts(step.plan, lane, at_event, met, impacts))
-        near, distances = _near_contacts(step.plan, lane, met, impacts)
-        rests, times = _resting_bodies(step.plan, lane, near, distances)
-        impacts = near
-    return _hold_resting(step.plan, step.taken, lane, at_event, rests, impacts, times)
+    plan, free = step.plan, step.trial.free_machines
+    if len(impacts) > 1:
+        lane = lane._replace(contact=_remaining_contacts(plan, lane, at_event, met, impacts))
+    # At the event, not at the step's end: its derivatives include the event's time.
+    speeds, slow = {}, jnp.zeros((), bool)
+    for k, impact in impacts.items():
+        sign, gap = plan.sign_and_gap(k, impact.contact)
+        rate = rate_of_position(free[k].field, plan.machine.coordinates[k], lane.s, at_event)
+        speeds[k] = impact.share * jnp.maximum(sign * rate, 0.0)
+        size = stop_gradient(plan.extent(k) + jnp.abs(gap))
+        force = jnp.abs(stop_gradient(step.trial.paths[k].end.a))
+        slow = slow | (impact.contact > 0) & _may_be_last(plan, lane, speeds[k], force, size)
+
+    def rest(lane: Lane) -> Lane:
+        if len(impacts) == 1:
+            ((k, impact),) = impacts.items()
+            arguments = k, impact, speeds[k], lane._replace(state=at_event)
+            ends, time = _remaining_chatter(plan, free[k], *arguments)
+            near, times = impacts, {k: time}
+            rests = {k: pin_flag((impact.contact > 0) & ends, lane.s)}
+        else:
+            near, distances = _near_contacts(plan, lane, met, impacts)
+            rests, times = _resting_bodies(plan, lane, near, distances)
+        return _hold_resting(plan, step.taken, lane, at_event, rests, near, times)
+
+    # Rare: skipped if no lane of a group may come to rest.
+    return jax.lax.cond(pin_flag(met & slow, lane.s), rest, lambda lane: lane, lane)
+
+
+def _may_be_last(
+    plan: Plan, lane: Lane, speed: Scalar, force: Scalar, size: Scalar | float
+) -> Flag:
+    """Return whether a rebound may be one of the last ones before rest, by a quick test: its hops
+    are over within several times the time of `_remaining_chatter`, under the force before the
+    impact or that of a motion of this size. An impact that it misses is followed by a slower one.
+    """
+    limit = stop_gradient(jnp.asarray(longest_step(plan.machine, lane.s, lane.state)))
+    brief = _SURELY_LONGER * (_BRIEF if lane.s.dtype == jnp.float64 else _BRIEF_SINGLE)
+    return stop_gradient(speed) * limit <= brief * (force * limit * limit + size)
 
 
 def _near_contacts(
@@ -557,11 +581,11 @@ def stop_bodies(
 
 def _remaining_chatter(
     plan: Plan, free: SmoothMachine, k: int, impact: ImpactResult, speed: Scalar, lane: Lane,
-    growth: Scalar | None = None, distance: Scalar | float = 0.0,
+    distance: Scalar | float = 0.0,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Return whether an impact is one of the endless last ones before rest, and the time they take.
-    `speed` is that of the rebound with respect to s; `growth` is the rate of the force; `distance`
-    is that from the stop, if the contact is only nearly closed."""
+    `speed` is that of the rebound with respect to s; `distance` is that from the stop, if the
+    contact is only nearly closed."""
     s, state, body = lane.s, lane.state, plan.machine.coordinates[k]
     sign, gap = plan.sign_and_gap(k, impact.contact)
     # The force on a body at rest, which has no damping by its velocity.
@@ -573,8 +597,7 @@ def _remaining_chatter(
     limit = stop_gradient(jnp.asarray(longest_step(plan.machine, s, state), s.dtype))
     # Hops no higher than rounding cannot be resolved, however long they last.
     height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
-    if growth is None:  # another impact of this instant may have changed it
-        growth = force_rate(free, body, free, s, at_rest)
+    growth = force_rate(free, body, free, s, at_rest)
     not_yet, hop, wait = _time_until_pressed(speed, pressing, sign * growth)
     height = jnp.where(not_yet, speed * hop - 0.5 * pressing * hop * hop, height)
     size = plan.extent(k) + jnp.abs(gap)

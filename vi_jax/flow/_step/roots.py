@@ -39,6 +39,13 @@ def rates(field: Field, coordinate: Coordinate, s: Scalar, state: State) -> Rate
     return Rates(coordinate.position(state), v, a)
 
 
+def rate_of_position(field: Field, coordinate: Coordinate, s: Scalar, state: State) -> Scalar:
+    """Return the rate of a coordinate alone along the flow of `field`."""
+    if coordinate.moves_at_velocity:
+        return coordinate.velocity(state)
+    return jax.jvp(coordinate.position, (state,), (field(s, state),))[1]
+
+
 def guard_rates(
     field: Field, guard: Callable[[Scalar, State], Any], s: Scalar, state: State
 ) -> Rates:

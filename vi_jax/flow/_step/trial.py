@@ -2,16 +2,16 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
-from ...machine import at_stop, is_alive, stops_of, switches_of
+from ...machine import at_stop, is_alive, stops_of, stops_on, switches_of
 from ..history import end_of_step, new_piece, piece_error
-from ..lane import FREE, Lane, any_of, to_event, to_release, to_turn_of, total
+from ..lane import FREE, Lane, any_of, select, to_event, to_release, to_turn_of, total
 from ..methods import Foreseen, stages_to_step_to
 from ..plan import Plan
 from ..smooth import Integrals, SmoothMachine, carried, elapsed, hold_contacts, stops_are_exact
@@ -26,6 +26,7 @@ from .guards import (
     guards_error,
     inner_guards,
     landing_tolerance,
+    may_turn_between,
     separate_stages,
     tolerance_factor,
     turn_tolerance,
@@ -91,6 +92,17 @@ def locate_release(
 _SLIVER = 1e-3
 
 
+class NearStop(NamedTuple):
+    """The force during a step on a coordinate that rests on a stop, or is slow near one."""
+
+    release: Release
+    begin: Scalar
+    """Rates of the force at both ends of the step; 0 elsewhere."""
+    end: Scalar
+    brief: Scalar
+    """The length of the shortest step that is cut at an extremum of the force."""
+
+
 class Path(NamedTuple):
     """One coordinate during a step."""
 
@@ -98,11 +110,8 @@ class Path(NamedTuple):
     end: Rates
     at_turn: Flag
     """True if the step was aimed at a turning point of the coordinate, and met it."""
-    release: Release | None
-    """Its release, if it can rest."""
-    force_rates: tuple[Scalar, Scalar, Scalar] | None
-    """Rates of the force at both ends, and the length of the shortest step that is cut at an
-    extremum of the force; `None` if the body cannot rest."""
+    near: NearStop | None
+    """The force on it near a stop; `None` if it cannot rest."""
     pull: Side | None
     """The force away from the stop on which the body rests, or its velocity against its direction
     while it is slow; `None` if it cannot rest."""
@@ -189,9 +198,10 @@ def try_step(
         stages = stages if method.adaptive else separate_stages(stages)
     else:
         new, integrals, error = method.step(smooth, lane.s, s1, lane.state, integrals)
+    rests = None
     if lane.contact is not None and not method.holds(machine):
         rests = lane.contact[0] > 0
-        new = jtu.tree_map(lambda a, b: jnp.where(rests, a, b), lane.state, new)
+        new = select(rests, lane.state, new)
     new = pin(new)
     bodies = range(len(machine.coordinates))
     free_machines = tuple(hold_contacts(machine, lane.modes, lane.contact, but=k) for k in bodies)
@@ -205,7 +215,8 @@ def try_step(
     def at(share: Scalar) -> State:
         if motion is not None:
             return motion.at(share * h)[0]
-        return method.step(smooth, lane.s, lane.s + share * h, lane.state, {})[0]
+        inside = method.step(smooth, lane.s, lane.s + share * h, lane.state, {})[0]
+        return inside if rests is None else select(rests, lane.state, inside)
 
     longest = jnp.asarray(limit)
     inner = inner_guards(plan, lane, free_machines, ends, stages, at, h, longest)
@@ -303,25 +314,32 @@ def _path(
         # Such an event may be a turning point as well.
         aimed = aimed | (lane.target >= to_event(len(stops_of(plan.machine))))
     at_turn = good & aimed & met
-    release, force_rates, pull = None, None, None
-    limited = any(stop.coordinate == k for stop in stops_of(plan.machine))
-    if lane.contact is not None and limited:
-        release = locate_release(plan, lane, k, begin, end, good, h)
-        force_rates = (
-            force_rate(free, body, smooth, lane.s, lane.state),
-            force_rate(free, body, smooth, s1, new),
-            stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
-        )
+    near, pull = None, None
+    if lane.contact is not None and stops_on(plan.machine, k):
+        at_rest = lane.contact[k] > 0
+        brief = stop_gradient(_SLIVER * limit + jnp.zeros_like(h))
+
+        def of_force(_: None) -> NearStop:
+            release = locate_release(plan, lane, k, begin, end, good, h)
+            places = (lane.s, lane.state), (s1, new)
+            first, last = (force_rate(free, body, smooth, *place) for place in places)
+            return NearStop(release, first, last, brief)
+
+        def far(_: None) -> NearStop:
+            no, zero = jnp.zeros_like(good), jnp.zeros_like(h)
+            return NearStop(Release(no, no, h, zero), zero, zero, brief)
+
+        asked = at_rest | may_turn_between(plan, lane, k, stop_gradient((begin, end)), h)
+        near = jax.lax.cond(asked, of_force, far, None)
         if k in inner.forces:
-            rests, away = lane.contact[k] > 0, plan.away(k, lane.contact[k])
-            slow, along = inner.slow[k], -lane.direction[k]
+            away, slow, along = plan.away(k, lane.contact[k]), inner.slow[k], -lane.direction[k]
             first, last = (
                 Rates(
-                    jnp.where(rests, away * r.a, jnp.where(slow, along * r.v, -1.0)),
-                    jnp.where(rests, away * rate, jnp.where(slow, along * r.a, 0.0)),
+                    jnp.where(at_rest, away * r.a, jnp.where(slow, along * r.v, -1.0)),
+                    jnp.where(at_rest, away * rate, jnp.where(slow, along * r.a, 0.0)),
                     r.a,
                 )
-                for r, rate in ((begin, force_rates[0]), (end, force_rates[1]))
+                for r, rate in ((begin, near.begin), (end, near.end))
             )
-            pull = Side(first, last, inner.forces[k], inner.slack[k], rests | slow)
-    return Path(begin, end, at_turn, release, force_rates, pull)
+            pull = Side(first, last, inner.forces[k], inner.slack[k], at_rest | slow)
+    return Path(begin, end, at_turn, near, pull)

@@ -139,8 +139,6 @@ class AbstractMethod(Shown):
         """Return the results of `step` and its stages: states within the step, for guards that its
         ends do not resolve; by default three places to step to."""
         new, beside, error = self.step(smooth, s0, s1, state, beside)
-        if not self.holds(smooth.machine):
-            return new, beside, error, []
         return new, beside, error, stages_to_step_to(QUARTERS, s0, s1 - s0)
 
     def guard_error(
