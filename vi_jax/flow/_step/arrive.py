@@ -438,9 +438,9 @@ def _land(step: AppliedStep, lane: Lane, places: Scalars) -> tuple[Lane, Scalars
         lane = lane.update_record(integrals=integrals)
         before = tuple(jnp.where(met, plan.machine.position(at_event), Y) for Y in before)
         lane = _apply_event(step, lane, at_event)
-    for k, path in enumerate(trial.paths):
-        if path.near is not None:
-            lane = _release_body(step, lane, k, path.near.release)
+    releases = {k: x.near.release for k, x in enumerate(trial.paths) if x.near is not None}
+    if releases:
+        lane = _release_bodies(step, lane, releases)
     places = (plan.machine.position(lane.state), *before)
     # At a switch the field may have an infinite slope (Hertz's damper at first touch). Derivatives
     # are finite along with the event, but not at a fixed clock.
@@ -515,7 +515,36 @@ def _at_fixed_clock(step: AppliedStep, lane: Lane) -> Lane:
     return lane._replace(s=s, state=state, slip=slip).update_record(integrals=integrals)
 
 
-def _release_body(step: AppliedStep, lane: Lane, k: int, release: Release) -> Lane:
+def _release_bodies(step: AppliedStep, lane: Lane, releases: dict[int, Release]) -> Lane:
+    """Return the lane after the bodies' releases on which the step landed."""
+    plan, before = step.plan, lane.contact
+    for k, release in releases.items():
+        lane = _at_release(step, lane, k, release)
+    contact = lane.contact
+    assert contact is not None and before is not None
+    if len(releases) > 1:  # a spare contact may take over
+        moving = lane.s, lane.state, lane.record.integrals
+        later = plan.in_units(_SOON + jnp.zeros_like(lane.s))
+        s, soon, _ = step.flow.extrapolate(stop_gradient(later), moving)
+        modes, kept = pressed_contacts(plan.machine, s, soon, lane.modes, contact, opened=before)
+        # Contacts that open next have releases of their own.
+        pairs = zip(kept, contact, strict=True)
+        kept = tuple(jnp.where(x == 0, jnp.abs(old), x) for x, old in pairs)
+        new, old = (constant_modes(modes, lane.s), kept), (lane.modes, contact)
+        met = any_of(step.taken, (x.landed for x in releases.values()))
+        modes, contact = select(met, new, old)
+        lane = lane._replace(modes=modes, contact=contact)
+    direction, clock = list(lane.direction), plan.clock(lane.s, lane.state)
+    for k, release in releases.items():
+        free, stop = release.landed, before[k] - to_event(0)
+        free = free & (contact[k] == 0) if len(releases) > 1 else free
+        direction[k] = jnp.where(free, -step.old.direction[k], direction[k])
+        lane = lane.log_event(step.taken & free, clock, EventKind.release, stop, jnp.nan)
+    return lane._replace(direction=tuple(direction))
+
+
+def _at_release(step: AppliedStep, lane: Lane, k: int, release: Release) -> Lane:
+    """Return the lane at the release of coordinate number k."""
     plan, flow, contact = step.plan, step.flow, lane.contact
     assert contact is not None
     free, offset = release.landed, stop_gradient(release.offset)
@@ -527,25 +556,11 @@ def _release_body(step: AppliedStep, lane: Lane, k: int, release: Release) -> La
         if not is_affine(plan.machine.coordinates[k].position, state):
             on_stops = _just_inside(plan, k, contact[k], on_stops)
         state = select(contact[k] > 0, on_stops, state)
-    s, stop = lane.s + jnp.where(free, offset, 0.0), contact[k] - to_event(0)
-    new = with_item(contact, k, jnp.where(free, 0.0, contact[k]))
-    if len(limited_in(plan.machine)) > 1:  # another contact may take over
-        later = stop_gradient(offset + plan.in_units(_SOON))
-        at, soon, _ = flow.extrapolate(later, moving)
-        modes, kept = pressed_contacts(plan.machine, at, soon, lane.modes, new, opened=contact)
-        lane = lane._replace(modes=select(free, constant_modes(modes, s), lane.modes))
-        pairs = zip(kept, contact, strict=True)
-        others = (jnp.where(x == 0, jnp.abs(old), x) for x, old in pairs)
-        new = select(free, with_item(tuple(others), k, kept[k]), contact)
-        free = free & (new[k] == 0)
-    direction = jnp.where(free, -step.old.direction[k], lane.direction[k])
-    lane = lane.log_event(step.taken & free, plan.clock(s, state), EventKind.release, stop, jnp.nan)
-    lane = lane.update_record(integrals=select(release.landed, integrals, lane.record.integrals))
+    lane = lane.update_record(integrals=select(free, integrals, lane.record.integrals))
     return lane._replace(
-        s=s,
-        state=select(release.landed, state, lane.state),
-        direction=with_item(lane.direction, k, direction),
-        contact=new,
+        s=lane.s + jnp.where(free, offset, 0.0),
+        state=select(free, state, lane.state),
+        contact=with_item(contact, k, jnp.where(free, 0.0, contact[k])),
     )
 
 
