@@ -238,7 +238,7 @@ class Feet(Block):
             height = lambda q, b=place: q.y + b * jnp.sin(q.tilt) - h * jnp.cos(q.tilt)
             along = lambda q, b=place: q.x + b * jnp.cos(q.tilt) + h * jnp.sin(q.tilt)
             rubs = dict(friction=self.mu, along=along)
-            found.append(vi.RigidStop(0.0, 0.0, "left", on=height, **rubs))
+            found.append(vi.RigidStop(0.0, self.restitution, "left", on=height, **rubs))
         return tuple(found)
 
     def force(self, t, q, v):
@@ -263,6 +263,24 @@ def test_a_third_foot_between_two_changes_nothing():
     np.testing.assert_allclose(found[:2], expected[:2], atol=1e-12)
     # After landings on two feet in turn, which are summed up.
     np.testing.assert_allclose(found[2:], expected[2:], atol=2e-6)
+
+
+@pytest.mark.slow
+def test_a_third_foot_comes_to_rest_with_two_others():
+    """The body is dropped on one foot and bounces to rest on all."""
+
+    def one(mu, size, tilt, places):
+        body = Feet(mu=mu, size=size, feet=places, restitution=0.3)
+        lift = jnp.maximum(-tilt * places[-1], -tilt * places[0]) + 0.5
+        run = vi.simulate(body, body.at(y=lift, tilt=tilt), 2, max_impacts=2000)
+        last = run.last
+        return run.successful, jnp.stack([last.x, last.y, last.tilt, last.v.x, last.v.tilt])
+
+    cases = jnp.array([(0.27, 3.0, 0.01), (0.5, 2.0, -0.02), (0.5, 2.0, 0.04)]).T
+    many = lambda places: jax.jit(jax.vmap(lambda *x: one(*x, places)))(*cases)
+    (two, expected), (three, found) = many((-0.33, 0.54)), many((-0.33, 0.0002, 0.54))
+    assert bool(two.all()) and bool(three.all())
+    np.testing.assert_allclose(found, expected, atol=1e-10)
 
 
 class Shaken(Block):

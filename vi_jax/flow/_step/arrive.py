@@ -11,6 +11,7 @@ from ...machine import (
     AbstractEvent,
     AbstractMachine,
     after_event,
+    chosen_stop,
     constant_modes,
     event_of,
     events_of,
@@ -26,6 +27,7 @@ from ...machine import (
     section_number,
     settled_modes,
     stops_of,
+    stops_on,
     struck_modes,
     switches_of,
 )
@@ -260,7 +262,8 @@ def release_pulled(
     together = is_compound(machine)
     kept = contact
     if together:
-        kept = pressed_contacts(machine, s, lane.state, modes, contact)[1]
+        closed = contact if contact_before is None else _with_touching(plan, lane, contact)
+        kept = pressed_contacts(machine, s, lane.state, modes, contact, opened=closed)[1]
     for k in limited_in(machine):
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
@@ -282,6 +285,18 @@ def release_pulled(
         contacts[k] = jnp.where(leaves, 0.0, contacts[k])
         direction[k] = jnp.where(leaves, -sign, direction[k])
     return lane._replace(contact=tuple(contacts), direction=tuple(direction))
+
+
+def _with_touching(plan: Plan, lane: Lane, contact: Scalars) -> Scalars:
+    """Return the contacts with those of bodies that touch a stop and move with it, to rounding."""
+    found, stops = list(contact), stops_of(plan.machine)
+    for k in limited_in(plan.machine):
+        body, (slack, slow) = plan.machine.coordinates[k], plan.rounding_bounds(k, lane.state)
+        place, still = body.position(lane.state), jnp.abs(body.velocity(lane.state)) <= slow
+        near = {i: still & (stops[i].beyond(place) >= -slack) for i in stops_on(plan.machine, k)}
+        touching = chosen_stop(plan.machine, k, near, jnp.zeros_like(lane.s))
+        found[k] = jnp.where(contact[k] == 0, stop_gradient(touching), contact[k])
+    return tuple(found)
 
 
 def _update_after(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> Lane:
