@@ -1,12 +1,48 @@
-"""Delay differential equations by the method of steps: SciPy, cut at events and at images."""
+"""Oscillators with delayed feedback, and delay differential equations by the method of steps:
+SciPy, cut at events and at images."""
 
 import heapq
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+import vi_jax as vi
 from scipy.integrate import solve_ivp
+
+
+class Fed(vi.AbstractMachine):
+    """A driven oscillator with delayed feedback of its position."""
+
+    omega: float = 0.8
+    damping: float = 0.05
+    gain: float = 0.3
+    delay: float = 4.0
+
+    cycle = property(lambda self: 2 * jnp.pi / self.omega)
+    delays = property(lambda self: dict(sensor=self.delay))
+
+    def field(self, t, z, past):
+        pull = self.gain * (past.sensor.x - z.x)
+        return dict(x=z.u, u=jnp.cos(self.omega * t) - z.x - 2 * self.damping * z.u + pull)
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
+
+
+class Struck(Fed):
+    """The same that hits a stop; `first` is its position before."""
+
+    gap: float = 0.6
+    restitution: float = 0.7
+    first: float = 0.0
+
+    before = property(lambda self: vi.State(x=self.first, u=0.0))
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(self.gap, self.restitution, on=("x", "u"))
 
 
 def by_steps(

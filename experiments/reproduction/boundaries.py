@@ -54,22 +54,17 @@ Curves = Mapping[str, Boundary]
 """Curves by the names of `CURVES`."""
 
 
-def table_damping() -> float:
-    """Return c of Table 1 (N·s/m)."""
-    return float(Parameters().damping)
+# c of Table 1 (N·s/m), and ξ of c = 1 N·s/m in its machine.
+TABLE_DAMPING = float(Parameters().damping)
 
 
 def xi_per_c() -> float:
-    """Return ξ of c = 1 N·s/m in the machine of Table 1 (m·s/N)."""
-    return table_damping_ratio() / table_damping()
+    return table_damping_ratio() / TABLE_DAMPING
 
 
 def follow_curves(names: Sequence[str], branches: Sequence[Branch] = ()) -> dict[str, Boundary]:
-    """Follow the named curves of `CURVES`.
-
-    **Arguments:** the names; branches in ζ on which the curves may begin, such as those of the
-    undamped response with k = 0.5. A missing branch is followed first.
-    """
+    """Follow the named curves of `CURVES`. They begin on `branches` in ζ; a missing branch is
+    followed first."""
     begins = dict.fromkeys(CURVES[name][:2] for name in names)
     known = {(cycles, k): _branch(cycles, k, branches) for cycles, k in begins}
 
@@ -112,11 +107,9 @@ def plane_points(curve: Boundary) -> np.ndarray:
 
 
 def _crossing(curve: Boundary, column: int, value: float, place: int) -> float | None:
-    """Return the other coordinate of a curve's first (0) or last (-1) point with a value.
-
-    Column 0 is ζ, column 1 is k or c. Splines interpolate the points; their error is below 1e-5.
-    The result is `None` if the curve does not reach the value.
-    """
+    """Return the other coordinate of a curve's first (0) or last (-1) point with a value of ζ
+    (column 0) or of k or c (column 1), `None` if it does not reach the value. Splines interpolate
+    the points; their error is below 1e-5."""
     spline = _spline(curve)
     here = CubicSpline(spline.x, plane_points(curve)[:, column])
     found = sorted(spline(here.solve(value, extrapolate=False))[:, 1 - column].tolist())
@@ -145,15 +138,13 @@ def _birth_without_damping(curves: Curves) -> float:
 
 
 def describe_boundaries(curves: Curves) -> dict[str, float | None]:
-    """Return numbers of the curves at the figures' ζ and k, and at Table 1's c.
-
-    A number is `None` if the curve does not reach this value, as the 4π curve at Table 1's c.
-    """
+    """Return numbers of the curves at the figures' ζ and k, and at Table 1's c; `None` if the curve
+    does not reach this value, as the 4π curve at Table 1's c."""
 
     def at(curve: str, column: int, value: float, place: int = 0) -> float | None:
         return _crossing(curves[curve], column, value, place)
 
-    zeta, k, c = FREQUENCY_RATIO, RESTITUTION, table_damping()
+    zeta, k, c = FREQUENCY_RATIO, RESTITUTION, TABLE_DAMPING
     top, bottom = _turn(curves["touch_c"], 1), _turn(curves["touch_k"], -1)
     return {
         "birth, undamped, ζ": _birth_without_damping(curves),
@@ -177,10 +168,7 @@ def describe_boundaries(curves: Curves) -> dict[str, float | None]:
 
 
 def draw_boundaries(curves: Curves) -> Figure:
-    """Draw both planes: on the left the whole plane, on the right the region of the discrepancy.
-
-    The upper row is (ζ, k), the lower row (ζ, c).
-    """
+    """Draw (ζ, k) above (ζ, c): the whole plane, and the region of the discrepancy."""
     figure = Figure(figsize=(12.5, 9.6), dpi=110)
     figure.set_layout_engine("constrained", w_pad=0.08)
     grid = figure.subplots(2, 2, width_ratios=(1.0, 1.25))
@@ -237,11 +225,11 @@ def _draw(ax: Axes, curves: Curves, plane: str, zoom: bool) -> None:
         ax.plot(*points.T, color=color, lw=1.8, ls=DASHES[kind])
     ax.plot(FREQUENCY_RATIO, RESTITUTION if in_k else 0.0, "k*", ms=11, clip_on=False, zorder=6)
     if not in_k:
-        ax.axhline(table_damping(), color="k", lw=1.0, ls=":")
-        ax.plot(FREQUENCY_RATIO, table_damping(), "kP", ms=9, zorder=6)
+        ax.axhline(TABLE_DAMPING, color="k", lw=1.0, ls=":")
+        ax.plot(FREQUENCY_RATIO, TABLE_DAMPING, "kP", ms=9, zorder=6)
         if not zoom:
             ax.text(
-                0.99, table_damping(), "c of Table 1", transform=ax.get_yaxis_transform(),
+                0.99, TABLE_DAMPING, "c of Table 1", transform=ax.get_yaxis_transform(),
                 ha="right", va="bottom", fontsize=10,
             )  # fmt: skip
     ax.set_xlim(*((0.68, 1.02) if zoom else RANGE))

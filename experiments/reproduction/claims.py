@@ -36,11 +36,8 @@ _NEAR = 0.3
 
 
 def check_claims(cases: tuple[Case, Case], panels: list[dict] | None = None) -> list[Claim]:
-    """Measure each claim about Figures 3 and 4 on the simulated cases.
-
-    **Arguments:** the cases; the panels of Figure 2 (`describe`). Without them the claim about the
-    whole figure is tested at ζ = 0.90 only.
-    """
+    """Measure each claim about Figures 3 and 4 on the simulated cases. Without the `panels` of
+    Figure 2 (`describe`) the claim about the whole figure is tested at ζ = 0.90 only."""
     checks = (
         _first_cycles, _near_short, _departure, _rounding, _settles, _agrees, _no_transient,
         _direct_short, partial(_maximum, panels or []), _minimum,
@@ -49,10 +46,7 @@ def check_claims(cases: tuple[Case, Case], panels: list[dict] | None = None) -> 
 
 
 def check_figure_2(found: Response, panels: list[dict]) -> list[Claim]:
-    """Measure each claim about the whole of Figure 2.
-
-    **Arguments:** the computed response of the figure; its panels as returned by `describe`.
-    """
+    """Measure each claim about the whole of Figure 2, whose panels `describe` returns."""
     return [_free(found), *(check(panels) for check in (_everywhere, _reason, _wall))]
 
 
@@ -66,10 +60,8 @@ def _each(cases: tuple[Case, Case], measure: Callable[[Case], Any]) -> dict[str,
 
 
 def _off(case: Case, part: slice, period: int) -> float:
-    """Return the greatest |Y - closed form| over a part of the cycles from rest.
-
-    `period` is that of the closed form, in cycles.
-    """
+    """Return the greatest |Y - closed form| over a part of the cycles from rest; `period` is that
+    of the closed form, in cycles."""
     Y = sampled(case.from_rest)[0]
     return float(np.abs(Y - closed_form(case, len(Y), period))[part].max())
 

@@ -25,11 +25,8 @@ def in_words(panel: dict[str, Any]) -> str:
 
 
 def _motion_name(cycles: int, impacts: float, exponent: float) -> str:
-    """Return the motion in words.
-
-    **Arguments:** the period in drive cycles, or a code of `REGIMES` below zero if none was found;
-    the mean number of impacts in a period; the median of the largest Lyapunov exponents.
-    """
+    """Return the motion in words, from its period or a code of `REGIMES` below zero, the mean
+    number of impacts in a period, and the median of the largest Lyapunov exponents."""
     if cycles > 0:
         return motion_name(cycles, round(impacts))
     if exponent > _CHAOS:
@@ -58,12 +55,9 @@ def _motions(ratios: np.ndarray, system: System, name: str, inside: np.ndarray) 
 
 
 def describe(found: Response) -> dict[str, Any]:
-    """Describe the differences between numerical minimum and 2π analysis, and the motions there.
-
-    The result has only floats, integers, strings, lists and `None`. "apart" counts the values with
-    |min Y - min Y of the 2π closed form| > 1e-3. "on_the_4pi_curve" compares all values at which
-    the one-impact 4π motion is admissible and stable.
-    """
+    """Describe the differences between numerical minimum and 2π analysis, and the motions there, in
+    types of JSON. "apart" counts the values with |min Y - min Y of the 2π closed form| > 1e-3,
+    "on_the_4pi_curve" those at which the one-impact 4π motion is admissible and stable."""
     panels = [_panel(found.ratios, system) for system in found.systems]
     return {"printed": WORDS["printed"], "panels": panels}
 

@@ -19,10 +19,7 @@ _INK = "0.2"
 
 
 def draw_figure(number: int, cases: tuple[Case, Case], path: Path) -> None:
-    """Draw Figure 3 (from rest) or 4 (from the 4π state) of the paper into a PNG file.
-
-    **Arguments:** 3 or 4; the undamped and the damped case; the file to write.
-    """
+    """Draw Figure 3 (from rest) or 4 (from the 4π state) of the paper into a PNG file."""
     figure = Figure(figsize=(14, 8.4), dpi=_DPI)
     figure.set_layout_engine("constrained", w_pad=0.08)
     grid = figure.subplots(2, 3, sharey=True)
@@ -73,10 +70,7 @@ def _forms(case: Case) -> list[tuple[int, Run, dict[str, Any]]]:
 
 
 def _panel(ax: Axes, number: int, case: Case, run: Run, window: tuple[int, int]) -> None:
-    """Draw a few cycles of the run with the closed forms on top.
-
-    **Arguments:** `number` of the figure; `window`, the first and the last cycle.
-    """
+    """Draw the cycles of a window of the run with the closed forms on top."""
     plot_history(
         run, machine=case.scene, ax=ax, window=window, stops=False, lw=3.2,
         color=_INK, alpha=0.55, label="simulation",

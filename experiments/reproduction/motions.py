@@ -128,11 +128,8 @@ def closed_form(case: Case, cycles: int, period: int) -> np.ndarray:
 
 
 def half_turn_states(run: Run) -> np.ndarray:
-    """Return (Y, V) at φ = π of each cycle, shape (cycles, 2).
-
-    The impacts of these motions lie near φ = 0. States on a section there would be before the jump
-    in some cycles and after it in others.
-    """
+    """Return (Y, V) at φ = π of each cycle, shape (cycles, 2). The impacts lie near φ = 0: states
+    on a section there would be before the jump in some cycles and after it in others."""
     Y, V, size = sampled(run)
     return np.stack([Y[:, size // 2], V[:, size // 2]], axis=1)
 
@@ -153,11 +150,8 @@ def mean_ratio(orbit: Orbit) -> float:
 
 
 def fit_long(scene: Scene) -> Orbit:
-    """Fit the 4π motion by optax' Adam from a state 5 % off the closed form.
-
-    The paper's Figure 4 needs such initial conditions, which are accurate enough to skip the
-    transient.
-    """
+    """Fit the 4π motion by optax' Adam from a state 5 % off the closed form, as accurately as the
+    paper's Figure 4 needs to skip the transient."""
     closed = closed_form_orbits(scene, cycles=2)
     guess = scene.start(Y=(1 + _WRONG) * closed.Y[0], V=(1 - _WRONG) * closed.V[0])
     steps = 2000

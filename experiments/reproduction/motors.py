@@ -99,10 +99,7 @@ def simulate_motors() -> tuple[list[TableRow], list[MotorRun]]:
 
 
 def draw_motors(motors: Sequence[MotorRun], ideal: Run) -> Figure:
-    """Draw the last 8π from rest with each motor above its crank speed.
-
-    **Arguments:** the motors' runs; the ideal drive's run from rest, for comparison.
-    """
+    """Draw the last 8π from rest with each motor, and with the ideal drive, above crank speeds."""
     figure = Figure(figsize=(14, 6.6), dpi=110)
     figure.set_layout_engine("constrained", w_pad=0.08)
     grid = figure.subplots(2, len(motors), sharex=True, sharey="row")

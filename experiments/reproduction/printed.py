@@ -52,10 +52,7 @@ def energy_drift(
     printed_inertia: float = 0.0,
 ) -> float:  # fmt: skip
     """Return the greatest |E/E(0) - 1| of a coasting run over 20 natural periods (k = 1, d = 2).
-
-    **Arguments:** ε and μ of the machine, which define the energy; other coefficients for the drive
-    equation, if it is to be integrated as printed.
-    """
+    ε and μ define the energy; the drive equation is integrated with the printed coefficients."""
     coefficient = coupling if printed_coupling is None else printed_coupling
     machine = CoastingMachine(
         contacts=(RigidStop(2.0, 1.0),),
@@ -74,13 +71,9 @@ def energy_drift(
 
 
 def eq21_misses(zeta: float, k: float, d: float, n: int, *, printed: bool) -> dict[str, float]:
-    """Return the residuals of Eq. 14 with Eq. 20 and 21 in the boundary conditions (16) to (18).
-
-    **Arguments:** ζ ≠ 1, k, d = Δ/a, the period 2πn; Eq. 21 as `printed`, or with its factor ζ.
-
-    **Returns:** v0 (dY/dφ before the impact), φ0 (rad), and the residuals: of (16) in units of a,
-    of (17) and (18) in units of a per radian.
-    """
+    """Return the residuals of Eq. 14 with Eq. 20 and 21, as `printed` or with its factor ζ, in the
+    boundary conditions (16), in units of a, and (17) and (18), in units of a per radian; with v0
+    (dY/dφ before the impact) and φ0 (rad). ζ is not 1, the period is 2πn."""
     A = 1 / (1 - zeta**2)
     half = np.pi * n / zeta
     slope = (1.0 if printed else zeta) * (1 + k) / (2 * A) / np.tan(half)

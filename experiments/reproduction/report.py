@@ -44,13 +44,11 @@ STEPS = (
 
 
 def reproduce(out: Path, tell: Callable[[str], None]) -> Findings:
-    """Draw Figures 1 to 4 and the boundaries of the discrepancy, and write the report.
+    """Draw Figures 1 to 4 and the boundaries of the discrepancy, and write the report into a
+    folder; `tell` is called with each of `STEPS` at its beginning.
 
     Figure 2 is computed in a second process. Most of the time is tracing, which holds Python's
     global lock, so threads would use only one core.
-
-    **Arguments:** the folder to write into, which is created if it is missing; a function that is
-    called with each of `STEPS` at its beginning. Double precision is needed.
     """
     out.mkdir(parents=True, exist_ok=True)
     # Ctrl-C ends the other process too, without a traceback.
@@ -115,10 +113,7 @@ def summary(claims: Sequence[Claim]) -> str:
 
 
 def differences(new: dict[str, Any], kept: dict[str, Any]) -> list[str]:
-    """Return the differences of two reports in verdicts and special points, in words.
-
-    **Arguments:** both reports as in `report.json`.
-    """
+    """Return the differences of two reports in verdicts and special points, in words."""
     verdicts, others = ({x["name"]: x["verdict"] for x in of["claims"]} for of in (new, kept))
     found = [
         f"{name}: {verdicts.get(name, 'absent')}, kept: {others.get(name, 'absent')}"

@@ -115,11 +115,7 @@ def _branches(
 
 @partial(jit, static_argnames="settle")
 def _carried(scene: Scene, numbers, values, starts, settle: int) -> Sweep:
-    """Sweep each row of values, all in one program.
-
-    **Arguments:** `numbers`, k and ξ of each row, (rows, 2); `values` of ζ, (rows, values);
-    `starts`, a state with one leading axis; `settle` in cycles.
-    """
+    """Sweep rows of values of ζ, each with its k and ξ in `numbers` and a start, in one program."""
 
     def one(numbers, values, start):
         here = _with_numbers(scene, numbers[0], numbers[1], values[0])
@@ -144,10 +140,7 @@ def _exponents(scene: Scene, numbers, values, starts):
 def _sweeps(
     scene: Scene, numbers: list[tuple[float, float]], ratios: np.ndarray
 ) -> list[tuple[dict[str, Any], ...]]:
-    """Return sweeps and exponents of each system by direction, all computed in one program.
-
-    **Arguments:** `numbers`, k and ξ of each system; `ratios`, the sorted values of ζ.
-    """
+    """Return sweeps and exponents of each system by direction, all computed in one program."""
     lanes = [(k, xi, up) for k, xi in numbers for up in (True, False)]
     pairs = np.array([lane[:2] for lane in lanes])
     values = np.stack([ratios if up else ratios[::-1] for *_, up in lanes])
@@ -184,11 +177,7 @@ def _sweeps(
 
 
 def _again(scene: Scene, flat: Sweep, pairs: np.ndarray, values: np.ndarray, which) -> None:
-    """Settle some values for another 1,000 cycles, and store the results in `flat`.
-
-    **Arguments:** `flat`, the sweeps as one row, changed in place; `pairs`, k and ξ of each value;
-    `values` of ζ; `which`, the indices to settle.
-    """
+    """Settle the values with these indices for another 1,000 cycles; change `flat` in place."""
     for some in _chunks(which):
         ends = jtu.tree_map(lambda x, some=some: x[some, -1], flat.sections)
         later = _carried(scene, pairs[some], values[some][:, None], ends, 1000)

@@ -30,10 +30,7 @@ _DOWN: dict[str, Any] = {
 
 
 def draw_response(found: Response, panels: list[dict]) -> Figure:
-    """Draw Figure 2: above the whole range of ζ, undamped and damped; below from BB' to CC'.
-
-    **Arguments:** the curves and marks; the panels as returned by `describe`.
-    """
+    """Draw Figure 2: above the whole range of ζ, undamped and damped; below from BB' to CC'."""
     titles = ["undamped, ξ = 0", f"Table 1, ξ = {found.systems[1].damping_ratio:.4f}"]
     figure = Figure(figsize=(15, 17.2))
     figure.set_layout_engine("constrained", w_pad=0.08)
@@ -100,11 +97,8 @@ def _colors(panels: list[dict]) -> dict[str, str]:
 def _curves(
     ax: Axes, ratios: np.ndarray, system: System, name_at: tuple[float, float], **look: Any
 ) -> None:
-    """Draw the curves of one system and its sweeps' least Y, the lines BB' and CC', and the wall.
-
-    **Arguments:** `ratios`, the values of ζ; `name_at`, ζ and Y of the wall's name; options for
-    the branches.
-    """
+    """Draw the curves of one system and its sweeps' least Y, the lines BB' and CC', and the wall
+    with its name at some ζ and Y."""
     for n in (2, 1):
         form = system.closed[n]
         for i in range(2):
@@ -148,10 +142,7 @@ def _whole(ax: Axes, found: Response, system: System) -> None:
 def _zoom(
     ax: Axes, ratios: np.ndarray, system: System, panel: dict, colors: dict[str, str]
 ) -> None:
-    """Draw the range from BB' to CC', with a strip of the motions' colours for each sweep.
-
-    **Arguments:** `ratios`, the values of ζ; `panel` with the motions; their `colors` by name.
-    """
+    """Draw the range from BB' to CC', with a strip of the motions' colours for each sweep."""
     _curves(ax, ratios, system, (0.658, WALL + 0.05), lw=1.5)
     ax.set_xlim(0.655, 1.01)
     ax.set_ylim(-4.45, -1.0)
@@ -167,10 +158,7 @@ def _zoom(
 
 
 def _name(ax: Axes, x: float, y: float, motion: str, width: float, color: str) -> None:
-    """Write a strip's motion, or only its period if the strip is too narrow.
-
-    **Arguments:** `x` and `y`, the strip's middle; its `width`; `color` behind the text.
-    """
+    """Write a strip's motion at its middle, or only its period if the strip is too narrow."""
     dark = np.dot(to_rgb(color), (0.3, 0.59, 0.11)) < 0.55
     for name in (motion, motion.partition(",")[0]):
         if width > 0.0026 * len(name):

@@ -10,7 +10,7 @@ import pytest
 import vi_jax as vi
 from vi_jax import lanes
 
-from delayed import by_steps, struck_by_steps
+from delayed import Struck, by_steps, struck_by_steps
 
 
 class Linear(vi.AbstractMachine):
@@ -24,33 +24,6 @@ class Linear(vi.AbstractMachine):
 
     def start(self):
         return vi.State(x=1.0)
-
-
-class Fed(vi.AbstractMachine):
-    """An oscillator that hits a stop, with delayed feedback of its position."""
-
-    omega: float = 0.8
-    damping: float = 0.05
-    gain: float = 0.3
-    delay: float = 4.0
-    gap: float = 0.6
-    restitution: float = 0.7
-    first: float = 0.0
-
-    cycle = property(lambda self: 2 * jnp.pi / self.omega)
-    delays = property(lambda self: dict(sensor=self.delay))
-    before = property(lambda self: vi.State(x=self.first, u=0.0))
-
-    @property
-    def contacts(self):
-        return vi.RigidStop(self.gap, self.restitution, on=("x", "u"))
-
-    def field(self, t, z, past):
-        pull = self.gain * (past.sensor.x - z.x)
-        return dict(x=z.u, u=jnp.cos(self.omega * t) - z.x - 2 * self.damping * z.u + pull)
-
-    def start(self):
-        return vi.State(x=0.0, u=0.0)
 
 
 class Turning(vi.AbstractMachine):
@@ -77,7 +50,7 @@ class Turning(vi.AbstractMachine):
         return vi.State(x=0.0, u=0.0)
 
 
-class Two(Fed):
+class Two(Struck):
     """Two delays, one of a velocity, and a history that is a function."""
 
     slow: float = 0.1
@@ -130,7 +103,7 @@ def test_linear_equation_is_exact():
 
 
 def test_impacts_with_feedback():
-    run = vi.simulate(Fed(), cycles=50, impact_log=3)
+    run = vi.simulate(Struck(), cycles=50, impact_log=3)
     end = [run.sections.x[jnp.array([5, 50])], run.sections.u[jnp.array([5, 50])]]
     wanted = [[-0.3721662410390, -0.3631911832734], [-0.7218104265337, -0.7155667014084]]
     np.testing.assert_allclose(end, wanted, rtol=0, atol=1e-9)
@@ -161,7 +134,7 @@ def test_derivatives_pass_through_history_and_images():
     values = jnp.array([0.3, 4.0, 0.7, 0.05, 0.6, 0.0])
 
     def end(values):
-        machine = Fed(**dict(zip(names, values, strict=True)))
+        machine = Struck(**dict(zip(names, values, strict=True)))
         last = vi.simulate(machine, cycles=5, method="reference").last
         return jnp.array([last.x, last.u])
 
@@ -230,15 +203,15 @@ def test_derivatives_with_delayed_velocity():
 
 
 def test_run_continues_with_its_history():
-    first = vi.simulate(Fed(), cycles=1, settle=2)
-    second = vi.simulate(Fed(), first.last, cycles=1, settle=1)
+    first = vi.simulate(Struck(), cycles=1, settle=2)
+    second = vi.simulate(Struck(), first.last, cycles=1, settle=1)
     np.testing.assert_allclose(second.last.x, -0.3721662410390, rtol=0, atol=1e-9)
-    again = vi.simulate(Fed(), first.last.state, cycles=1, settle=1)  # without its history
+    again = vi.simulate(Struck(), first.last.state, cycles=1, settle=1)  # without its history
     assert abs(float(again.last.x - second.last.x)) > 1e-3
 
 
 class Masses(vi.Mechanical):
-    """`Fed` as a machine of masses."""
+    """`Struck` as a machine of masses."""
 
     q = ("x",)
     mass = (1.0,)
@@ -256,8 +229,8 @@ def test_machine_of_masses():
     np.testing.assert_allclose(run.last.x, -0.3721662410390, rtol=0, atol=1e-9)
 
 
-class Rubbing(Fed):
-    """`Fed` with dry friction."""
+class Rubbing(Struck):
+    """`Struck` with dry friction."""
 
     level: float = 0.3
     history_size = 301
@@ -287,7 +260,7 @@ def test_impacts_and_friction():
     compare_with_steps(machine, 2, ("impact", "mode"), (-1, 0, 1))
 
 
-class Resting(Fed):
+class Resting(Struck):
     history_size = 501
 
 
@@ -333,7 +306,7 @@ def test_reset_reads_the_past():
 
 
 def test_full_history_ends_a_lane_with_its_reason():
-    class Short(Fed):
+    class Short(Struck):
         history_size = 9
 
     run = vi.simulate(Short(), cycles=5)
@@ -342,7 +315,7 @@ def test_full_history_ends_a_lane_with_its_reason():
 
 
 def test_traced_delays_out_of_range_end_their_lanes():
-    lane = lambda delay: vi.simulate(Fed(delay=delay), cycles=2).result.number
+    lane = lambda delay: vi.simulate(Struck(delay=delay), cycles=2).result.number
     found = jax.jit(jax.vmap(lane))(jnp.array([4.0, -1.0, 1e-3]))
     assert found.tolist() == [0, 1, 1]
 
@@ -370,7 +343,7 @@ def program(machine):
 
 
 def test_machines_without_delays_have_no_more_operations(monkeypatch):
-    programs = [program(machine) for machine in (Plain(), Empty(), Fed())]
+    programs = [program(machine) for machine in (Plain(), Empty(), Struck())]
     sizes = [text.count(" = ") for text in programs]
     assert sizes[0] == sizes[1] > 1000 and sizes[2] > 1.2 * sizes[0]
 
@@ -386,10 +359,10 @@ def test_machines_without_delays_have_no_more_operations(monkeypatch):
     jax.clear_caches()
     assert program(Plain()).count(" = ") == sizes[0]
     with pytest.raises(AssertionError, match="only for machines with delays"):
-        program(Fed())
+        program(Struck())
 
 
-class Renewed(Fed):
+class Renewed(Struck):
     def renewed(self, state):
         return state.replace(x=0.0)
 
@@ -410,11 +383,11 @@ class NoBefore(Turning):
 def test_refusals_name_what_is_wrong():
     noise = dict(noise=vi.WhiteNoise(dict(u=0.1)), key=jax.random.key(0))
     for machine, options, words in (
-        (Fed(delay=1e-3), {}, "a thousandth of a cycle"),
-        (Fed(delay=-1.0), {}, "sensor is -1"),
-        (Fed(), noise, "must be left out for a Fed"),
-        (Fed(), dict(method=vi.Taylor()), "must be `Adaptive` or `FixedStep`"),
-        (Fed(), dict(method=vi.ExactFlight()), "must be `Adaptive` or `FixedStep`"),
+        (Struck(delay=1e-3), {}, "a thousandth of a cycle"),
+        (Struck(delay=-1.0), {}, "sensor is -1"),
+        (Struck(), noise, "must be left out for a Struck"),
+        (Struck(), dict(method=vi.Taylor()), "must be `Adaptive` or `FixedStep`"),
+        (Struck(), dict(method=vi.ExactFlight()), "must be `Adaptive` or `FixedStep`"),
         (Renewed(), {}, "must not have both `delays` and `renewed`"),
         (Blind(), {}, "nothing reads its past"),
         (NoBefore(), {}, "`before` of a NoBefore must be given"),
@@ -424,4 +397,4 @@ def test_refusals_name_what_is_wrong():
     with pytest.raises(TypeError, match="must take the machine, `s`, the state, the past"):
         vi.simulate(WithoutPast())
     with pytest.raises(TypeError, match=r"needs the chain as its machine, .* `orbit.machine`"):
-        vi.simulate(Fed(), vi.delay_chain(Fed()).start())
+        vi.simulate(Struck(), vi.delay_chain(Struck()).start())

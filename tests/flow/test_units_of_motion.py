@@ -3,12 +3,13 @@
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+
+from own_units import MACHINES, Sliding, Struck, machine_of, units_of
 
 pytestmark = pytest.mark.slow
 
@@ -197,82 +198,30 @@ def test_structure_of_two_masses_in_closed_form():
     assert np.all(impacts[:, 0].sum(axis=1) > 3)
 
 
-NAMES = ("x", "u", "p", "w")
-# The unit of each component on its own.
-OWN_UNITS = np.array([np.ones(4), *(np.where(np.arange(4) == i, unit, 1.0)
-                      for i in range(4) for unit in (1e-6, 1e6))])  # fmt: skip
+class Resting(Struck):
+    """A load that varies holds the body on its stop for a part of each cycle."""
 
+    value = 0.2
 
-class Mixed(vi.AbstractMachine):
-    """A driven body, with a pressure far from zero and a slow sum: each in a unit of its own."""
-
-    scales: Any
-    kind: str = eqx.field(static=True)
-
-    cycle = 2 * np.pi / 0.9
-
-    @property
-    def contacts(self):
-        length, speed, *_ = self.scales
-        stop = lambda gap, k, side="right": vi.RigidStop(gap * length, k, side, on=("x", "u"))
-        dry = lambda level, **more: vi.DryFriction(level * speed, on="u", **more)
-        return {
-            "stop": (stop(0.5, 0.7),),
-            "rests": (stop(0.2, 0.4), stop(1.0, 0.6, "left")),
-            "dry": (dry(0.5, static_ratio=1.3),),
-            "belt": (dry(0.5, slip=lambda z: z.u - 0.3 * speed),),
-            "both": (stop(0.4, 0.5), dry(0.2)),
-            "section": (stop(0.4, 0.8, "left"),),
-        }.get(self.kind, ())
-
-    @property
-    def events(self):
-        length, speed, pressure, total = self.scales
-        drain = lambda m, t, z: dict(p=z.p - 0.08 * pressure, w=z.w + 0.1 * total)
-        return {
-            "slides": (vi.Switch(lambda m, t, z: z.u / speed + 0.2 * z.x / length, slides=True),),
-            "resets": (
-                vi.Reset(lambda m, t, z: z.p - 100.05 * pressure, drain),
-                vi.Reset(lambda m, t, z: z.x, lambda m, t, z: dict(u=0.8 * z.u)),
-            ),
-        }.get(self.kind, ())
-
-    def field(self, t, z, *side):
-        x, u, p, w = (
-            getattr(z, name) / unit for name, unit in zip(NAMES, self.scales, strict=True)
-        )
-        push = {
-            "rests": 0.8 + 1.5 * jnp.cos(0.9 * t) - x - 0.1 * u,
-            "slides": 1.2 * jnp.cos(0.9 * t) - x - 0.5 * sum(side),
-            "section": 0.5 * u * (1 - 4 * x * x) - x,
-        }.get(self.kind, jnp.cos(0.9 * t) - x - 0.1 * u)
-        rates = u, push, 0.3 * (x - (p - 100.0)), 0.1 * (x * x - w)
-        return {n: unit * rate for n, unit, rate in zip(NAMES, self.scales, rates, strict=True)}
-
-
-class Observed(Mixed):
-    cycle = vi.rising("u", usual=6.3)
-
-
-KINDS = ("stop", "rests", "dry", "belt", "both", "slides", "resets", "section")
+    def rates(self, t, x, u, q, w):
+        rate, push, *others = super().rates(t, x, u, q, w)
+        return rate, push + 0.8 + 0.5 * jnp.cos(0.8 * t), *others
 
 
 # With the tolerance 1e-10 of `Taylor`, a pressure of 1e8 allowed errors of 2e-6 in the others.
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*MACHINES, Resting])
 @pytest.mark.parametrize("method", [vi.Adaptive(), vi.FixedStep(), vi.Taylor(rtol=1e-10)])
 def test_each_component_has_a_unit_of_its_own(kind, method):
-    if kind == "slides" and isinstance(method, vi.Taylor):
+    if kind is Sliding and isinstance(method, vi.Taylor):
         return  # a blend of two fields has no series
-
-    machine = Observed if kind == "section" else Mixed
-
-    def lane(units):
-        start = vi.State(**dict(zip(NAMES, units * jnp.array([0.1, 0.2, 100.0, 0.0]), strict=True)))
-        run = vi.simulate(machine(units, kind), start, 4, method=method, event_log=10)
-        sections = [getattr(run.sections, n) / unit for n, unit in zip(NAMES, units, strict=True)]
-        return jnp.stack(sections), run.event_log.phase, run.event_log.number, run.successful
-
-    *found, numbers, successful = jax.jit(jax.vmap(lane))(OWN_UNITS)
-    assert_equal_in_all_units([x[None] for x in found], successful, 1e-9)
-    np.testing.assert_array_equal(numbers, np.broadcast_to(numbers[:1], numbers.shape))
-    assert np.count_nonzero(numbers[0] >= 0) > 3
+    first = None
+    for scales in [np.ones(len(kind.names)), *units_of(kind)]:
+        machine = machine_of(kind, scales)
+        run = vi.simulate(machine, machine.start(), 8, method=method, event_log=10)
+        assert bool(run.successful)
+        found = machine.row(run.sections), run.event_log.phase
+        first = first or (*found, run.event_log.number)
+        for x, y in zip(found, first[:2], strict=True):
+            np.testing.assert_allclose(x, y, rtol=0, atol=1e-9, err_msg=str(scales))
+        np.testing.assert_array_equal(run.event_log.number, first[2])
+    assert np.count_nonzero(first[2] >= 0) > 3

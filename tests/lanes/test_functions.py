@@ -260,3 +260,28 @@ def test_division_of_integers(kind, count):
     mine = once(both, a, b, backend="auto")
     for x, y in zip(mine, jax.jit(jax.vmap(both))(a, b), strict=True):
         np.testing.assert_array_equal(x, y)
+
+
+def test_equal_calls_are_made_once_and_unused_results_are_not_computed(monkeypatch):
+    """A part with a square root and a long chain is called three times, twice with the
+    same numbers, and a fourth time for the root alone."""
+    texts, write = [], lanes.runtime.kernel_text
+    monkeypatch.setattr(
+        lanes.runtime, "kernel_text", lambda *a: texts.append(write(*a)) or texts[-1]
+    )
+
+    @jax.jit
+    def part(x):
+        y = x
+        for n in range(60):
+            y = 0.5 * y + jnp.tanh(x + n)
+        return jnp.sqrt(jnp.abs(x)), y
+
+    def several(x, y):
+        return part(x), part(y), part(x), part(x * y)[0]
+
+    compiled, expected = (once(several, X[:8], Y[:8], backend=b) for b in ("llvm", "xla"))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), compiled, expected)
+    (text,) = texts
+    kernel = text.split("define void @kernel")[1]
+    assert kernel.count("call fastcc") == 2

@@ -189,16 +189,6 @@ def test_multipliers_have_the_determinant_and_are_those_of_the_cycle_map():
     np.testing.assert_allclose(found, wanted, atol=1e-8)
 
 
-def test_damped_motions_tend_to_the_undamped_one():
-    undamped = solve(0.9, 0.0, 0.5, 2.0, 1)
-    errors = []
-    for xi in (1e-4, 1e-6, 1e-12):
-        damped = solve(0.9, xi, 0.5, 2.0, 1)
-        errors.append(abs(float(damped.Y[0] - undamped.Y[0])))
-        assert errors[-1] < 20 * xi + 1e-13
-    assert errors[0] > 50 * errors[1] > 0
-
-
 def test_resonance_is_the_limit_from_both_sides():
     # At resonance cos φ0 = 1 and v = nπ/(1 + k), for every gap.
     for n in (1, 2):

@@ -6,28 +6,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-
-class Fed(vi.AbstractMachine):
-    """A driven oscillator with delayed feedback."""
-
-    omega: float = 0.8
-    damping: float = 0.05
-    gain: float = 0.3
-    delay: float = 4.0
-
-    cycle = property(lambda self: 2 * jnp.pi / self.omega)
-    delays = property(lambda self: dict(sensor=self.delay))
-
-    def field(self, t, z, past):
-        pull = self.gain * (past.sensor.x - z.x)
-        return dict(x=z.u, u=jnp.cos(self.omega * t) - z.x - 2 * self.damping * z.u + pull)
-
-    def start(self):
-        return vi.State(x=0.0, u=0.0)
-
-
-class Struck(Fed):
-    contacts = vi.RigidStop(0.6, 0.7, on=("x", "u"))
+from delayed import Fed, Struck
 
 
 @pytest.mark.slow

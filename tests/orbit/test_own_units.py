@@ -48,30 +48,31 @@ def test_orbits_in_single_precision(kind):
         assert_same_orbits(kind, 2e-3)
 
 
-# A multiplier is infinite at a grazing that ends a branch.
+def branches(kind):
+    """Yield the branch of each variant, and the variant in words."""
+    for machine in variants(kind):
+        orbit = found_by(machine)
+        branch = vi.continue_orbit(orbit, parameter="p", bounds=kind.bounds, progress=False)
+        yield branch, f"{machine.scales} {machine.phase} {machine.is_flipped}"
+
+
 @pytest.mark.parametrize("kind", MACHINES)
 def test_branches(kind):
     first = None
-    for machine in variants(kind):
-        branch = vi.continue_orbit(
-            found_by(machine), parameter="p", bounds=kind.bounds, progress=False
-        )
+    for branch, case in branches(kind):
         found = branch.ends, [(x.kind, round(x.parameter, 8)) for x in branch.special]
         first = first or found
-        assert found == first, (machine.scales, machine.phase, machine.is_flipped)
+        assert found == first, case
 
 
 @pytest.mark.parametrize("kind", [Struck, Pair, Colliding, Cranked])
 def test_local_maps(kind):
     first = None
-    for machine in variants(kind):
-        branch = vi.continue_orbit(
-            found_by(machine), parameter="p", bounds=kind.bounds, progress=False
-        )
+    for branch, case in branches(kind):
         point = next(x for x in branch.special if x.kind == "grazing")
         graze = vi.grazing(point, check=False)
         entries = graze.entries / np.abs(graze.entries).max()
         found = graze.touched.split()[0], str(graze.outcome), graze.forecast.period.tolist()
         first = first or (found, entries)
-        assert found == first[0], (machine.scales, machine.phase, machine.is_flipped)
+        assert found == first[0], case
         np.testing.assert_allclose(entries, first[1], rtol=0, atol=1e-6)

@@ -89,6 +89,9 @@ def test_each_bifurcation_of_two_oscillators_is_found():
     np.testing.assert_allclose(doublings[2], [0.19582944, 0.2070924], atol=1e-8)
     np.testing.assert_allclose(doublings[3], [0.19563381, 0.19582944], atol=1e-8)
     assert all("twice" in point.detail for point in one.special)
+    fold = next(point for point in one.special if point.kind == "fold")
+    with pytest.raises(ValueError, match="a fold of two motions at once"):
+        vi.boundary(fold, parameter="omega", bounds=((0.02, 0.25), (1.0, 1.4)))
     assert len(places(one, "fold")) == len(places(weak, "fold")) == 2
     np.testing.assert_allclose(places(weak, "branch-point")[0], 0.08000716, atol=1e-8)
     for branch in (one, weak, strong, unlike):
@@ -112,21 +115,6 @@ def test_a_branch_that_leaves_another_to_both_sides():
     assert len(places(off, "fold")) == 6
     again = next(point for point in off.special if point.kind == "branch-point").switch().state
     assert abs(float(again["y1"] - again["y2"])) < 1e-9
-
-
-@pytest.mark.slow
-def test_a_curve_of_folds_of_both_oscillators():
-    """Two multipliers are 1 along the curve, which is that of one oscillator. Compare its cusp with
-    an independent shooting code."""
-    fold = next(point for point in branch_of(0.0).special if point.kind == "fold")
-    curve = vi.boundary(fold, parameter="omega", bounds=((0.02, 0.25), (1.0, 1.4)))
-    assert curve.ends == ("bounds", "bounds")
-    (cusp,) = curve.special
-    assert cusp.kind == "cusp"
-    np.testing.assert_allclose(cusp.parameters, [0.06238715591, 1.289889567], atol=1e-8)
-    for i in range(0, len(curve.steps), 15):
-        values = np.linalg.eigvals(monodromy(SimpleNamespace(orbit=curve.orbit(i))))
-        assert np.sum(np.abs(values - 1) < 1e-5) == 2
 
 
 @pytest.mark.exhaustive

@@ -1,9 +1,10 @@
-"""Pictures of motions agree with the simulation: points, impacts, stops, units."""
+"""Pictures of motions agree with the simulation: points, impacts, stops, units, and styles."""
 
 import matplotlib
 
 matplotlib.use("Agg")
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -79,3 +80,19 @@ def test_history_of_a_machine_counts_cycles():
     ax = plot_history(run, machine=ball, ax=_axes())
     assert ax.get_xlabel() == "cycles since the start" and ax.get_ylabel() == "height (g/ω²)"
     assert ax.lines[0].get_xdata().max() == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "width", "points", "line"), [("journal", 85 / 25.4, 8, 1.0), ("slides", 6, 16, 2.2)]
+)
+def test_sizes_of_figure_words_and_lines(run, name, width, points, line):
+    with plt.style.context(f"vi_jax.plot.{name}"):
+        ax = vi.plot_history(run)
+    assert ax.figure.get_size_inches()[0] == pytest.approx(width, abs=1e-3)
+    assert ax.xaxis.label.get_size() == points
+    plain = vi.plot_history(run)
+    assert tuple(plain.figure.get_size_inches()) == (7, 3.5)
+    ratio = ax.lines[0].get_linewidth() / plain.lines[0].get_linewidth()
+    assert ratio == pytest.approx(line / 1.5)
+    plt.close(plain.figure)
+    plt.close(ax.figure)

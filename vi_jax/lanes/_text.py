@@ -84,7 +84,7 @@ RARE = '!0 = !{!"branch_weights", i32 1, i32 200}'
 
 
 def attributes(bits: int) -> str:
-    """Return the attributes of a kernel's functions, for registers of so many bits. LLVM (20) does
+    """Return the attributes of a kernel's functions, for registers of so many bits. LLVM (22) does
     not align the stack of a function that calls no other, so that each register kept there would
     cross a cache line: a sixth of the time."""
     widths = f'"min-legal-vector-width"="{bits}" "prefer-vector-width"="{bits}"'

@@ -167,13 +167,21 @@ def _needed_equations(jaxpr: Jaxpr) -> list[Any]:
     return kept[::-1]
 
 
+# A call of a large part keeps its unused results if it needs more than this share of the part. A
+# choice: as parts of their own, they made the text of a block on two corners a third longer.
+_LITTLE = 0.25
+
+
 def _without_unused(eqn: Any, used: tuple[bool, ...]) -> Any:
     """Return a call without the results that are not `used`, and without the arguments that only
     they need: a derivative of a field is often wanted for one of its numbers. Other equations are
     returned as they are."""
     if eqn.primitive.name != "jit":
         return eqn
-    body, needed = _reduced(eqn.params[CALLS["jit"]], used)
+    whole = eqn.params[CALLS["jit"]]
+    body, needed = _reduced(whole, used)
+    if size_of(inner(body)) > max(_LEAST_FUNCTION, _LITTLE * size_of(inner(whole))):
+        return eqn
     return eqn.replace(
         invars=list(itertools.compress(eqn.invars, needed)),
         outvars=list(itertools.compress(eqn.outvars, used)),

@@ -19,7 +19,9 @@ from .results import (
 )
 from .root_finders import AbstractRootFinder, Gradient, Newton
 from .special import Point
-from .birkhoff import agreement, digits_of, rotation_number, without_angles
+from .birkhoff import (
+    QUASIPERIODIC, WANDERS, agreement, digits_of, rotation_number, without_angles,
+)
 from .torus import Torus, find_torus
 from .torus_branch import TorusBranch, Window, continue_torus
 from . import switch  # registers what begins at special points

@@ -14,7 +14,11 @@ from .._types import Number, Scalar
 from .tolerances import ROUNDING
 
 # The spread by errors of a method, as a multiple of its `wander`: a choice.
-_WANDERS = 10.0
+WANDERS = 10.0
+
+# Averages of a quasi-periodic motion agree to more digits. Those of 35 tori of an oscillator with a
+# stop agreed to 5.3 and more over 2,048 cycles, those of chaos to 2.
+QUASIPERIODIC = 4.4
 
 # Averages agree to so many digits at most, the rounding of double precision.
 _MOST = 16.0
@@ -60,7 +64,7 @@ def digits_of(difference: Array, spread: Array, mean: Array, wander: Number = 0.
 
 
 def _moves(spread: Array, size: Array, wander: Number) -> Array:
-    still = jnp.maximum(ROUNDING, _WANDERS * jnp.asarray(wander, spread.dtype))
+    still = jnp.maximum(ROUNDING, WANDERS * jnp.asarray(wander, spread.dtype))
     return spread > still * jnp.maximum(jnp.abs(size), 1.0)
 
 

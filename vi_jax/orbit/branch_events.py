@@ -60,8 +60,8 @@ from .locate import SPACING, crossing, dip_of
 from .results import Orbit
 from .sliding import change_at, locate_change
 from .special import Point, further_of, point_at
-from .tolerances import ALIKE, LOCATED, ROUNDING, SAME
-from .walk import Ending, Event, Table, bound_rows
+from .tolerances import ALIKE, BRIEF, LOCATED, ON_CIRCLE, ROUNDING, SAME
+from .walk import SAME_CURVE, Ending, Event, Table, bound_rows
 from .words import coincidence_in_words, grazing_in_words, place_in_words
 
 # These thresholds are choices; measured ones have the figure in the comment.
@@ -80,13 +80,6 @@ _ALMOST_ALIKE = 10.0
 # rimless wheel near its homoclinic motion the multiplier is then correct to 2e-12.
 _LONG = 4.0
 
-# A flight between two rests vanishes if it is this brief (a cycle is 2π).
-_BRIEF = 1e-3
-
-# A multiplier passes if it is this close to the zero of its test. Otherwise that is a pole of the
-# determinant, or a real pair μ, 1/μ.
-_AT_ZERO = 1e-5
-
 # The description of a branch point at which this branch begins.
 _BEGINS = "a multiplier touches 1: this branch begins at another one, on both sides"
 
@@ -95,9 +88,6 @@ _MOST_HALVINGS = 17
 
 # Most parabolas to find a dip of a test within a step: one, if the dip is a parabola. A choice.
 _MOST_PARABOLAS = 3
-
-# Cosine of the angle between tangents of one branch so close to each other: a choice.
-_SAME_DIRECTION = 0.99
 
 # An extremum is a corner if the rate there exceeds this share of the rates on both sides: a choice,
 # far above the remainder at a place that is located to rounding.
@@ -381,7 +371,7 @@ class MotionTable(Table):
         sides = [self.advance(here.x, here.tangent, root + x) for x in (-SPACING, SPACING)]
         passes = [bifurcation_tests(step)[CROSSING] for step in sides]
         # A point on the crossing branch has another tangent.
-        alike = np.dot(sides[0].tangent, sides[1].tangent) > _SAME_DIRECTION
+        alike = np.dot(sides[0].tangent, sides[1].tangent) > SAME_CURVE
         is_fold = alike and all(bool(step.good) for step in sides) and passes[0] * passes[1] < 0
         return tuple(sides) if is_fold else ()
 
@@ -394,7 +384,7 @@ class MotionTable(Table):
         if float(here.tangent[-1]) * float(last.tangent[-1]) < 0:  # other branches cross as well
             at = self._crossing(here, at, FOLD)
         for kind, distances in _distances_from_circle(at).items():
-            if np.sum(np.abs(distances) < 10 * _AT_ZERO) > (2 if kind == TORUS else 1):
+            if np.sum(np.abs(distances) < 10 * ON_CIRCLE) > (2 if kind == TORUS else 1):
                 return [(self._point(kind, at, f"{KINDS[kind].detail}; twice, at once"), at)]
         return []
 
@@ -413,8 +403,8 @@ class MotionTable(Table):
             return [(self._point(TURN, at, KINDS[TURN].detail), at)]
         if kind == TURNS or (kind == CROSSING and (self.symmetric or not held)):
             at = self._crossing(here, at, kind)
-        if np.abs(_distances_from_circle(at)[kind]).min(initial=np.inf) >= _AT_ZERO:
-            return []
+        if np.abs(_distances_from_circle(at)[kind]).min(initial=np.inf) >= ON_CIRCLE:
+            return []  # a pole of the determinant, or a real pair μ, 1/μ
         detail = _BEGINS if kind == TURNS else KINDS[kind].detail
         if kind == TURNS:
             kind = CROSSING
@@ -463,7 +453,7 @@ def _brief_flight(problem: Shooting, at: Step) -> int | None:
     first = int(np.argmin(lengths))
     leaving, after = (problem.events[i % problem.legs] for i in (first, first + 1))
     lands = leaving.use == LEAVES and after == leaving._replace(use=LANDS)
-    return first if lands and lengths[first] < _BRIEF * problem.radian else None
+    return first if lands and lengths[first] < BRIEF * problem.radian else None
 
 
 # The number of multipliers that cross the unit circle at a change of sign of each test.

@@ -177,8 +177,7 @@ def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
     shifted = lambda s: s.observed.monodromy + sign * np.eye(len(s.observed.monodromy))
     double = scalar(lambda s: float(sum_of_minors(shifted(s))))
     if condition.kind == FOLD:
-        tests = {CUSP: _cusp_test(motion, 2 if condition.double else 1), FLIP: doubling}
-        return tests if condition.double else tests | {RESONANCE_1: double}
+        return {CUSP: _cusp_test(motion), FLIP: doubling, RESONANCE_1: double}
     if condition.kind == DOUBLING:
         return {DEGENERATE: _cubic_test(motion, twice=True), FLIP: fold, RESONANCE_2: double}
     if condition.kind == CROSSING:
@@ -203,22 +202,16 @@ def _null_vectors(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
     return Vectors(*(np.sign(overlap) * a for a in found))
 
 
-def _cusp_test(motion: Shooting, dimension: int) -> Test:
+def _cusp_test(motion: Shooting) -> Test:
     """Return a test for cusps: the signed rate of the parameters along a curve of folds.
 
     With the left null vector l of F_x the parameters change so that l·F_p dp = 0, along the line
-    across l·F_p. That line turns slowly, while their direction reverses at a cusp. If there are
-    `dimension` null vectors, the parameters act on the one that is used.
+    across l·F_p. That line turns slowly, while their direction reverses at a cusp.
     """
 
     def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
         jacobian = jacobian_at(motion, step.x)
         nulls = _null_vectors(jacobian[:, :-2], like)
-        if dimension > 1:
-            lefts = np.linalg.svd(jacobian[:, :-2])[0][:, -dimension:].T
-            left = np.linalg.svd(lefts @ jacobian[:, -2:])[0][:, 0] @ lefts
-            sense = 1.0 if like is None else np.sign(left @ like.left)
-            nulls = nulls._replace(left=sense * left)
         first, second = nulls.left @ jacobian[:, -2:]
         moves = np.asarray(step.tangent)[-2:]
         return float(moves @ [-second, first] / np.hypot(first, second)), nulls

@@ -244,10 +244,6 @@ class Special(AbstractCondition):
     replacement: Replacement | None = None
     speed: Scalar | float = 0.0
     """V⁻ of that impact, for motions near a grazing."""
-    double: bool = eqx.field(static=True, default=False)
-    """True if two multipliers are 1 all along a curve of folds, with an eigenvector each, as for
-    uncoupled equal machines. Then det(M - I) has a double zero. The condition is that the product
-    of its other factors is zero, which is the sum of the principal minors."""
 
     @property
     def observes(self) -> bool:
@@ -271,8 +267,7 @@ class Special(AbstractCondition):
             return observed.approach[i] - self.speed
         matrix = compound(observed.monodromy) if self.kind == TORUS else observed.monodromy
         matrix = matrix - KINDS[self.kind].multiplier * jnp.eye(matrix.shape[0], dtype=x.dtype)
-        zero = sum_of_minors(matrix) if self.double else jnp.linalg.det(matrix)
-        return zero * jnp.prod(observed.approach)
+        return jnp.linalg.det(matrix) * jnp.prod(observed.approach)
 
 
 def bifurcation_tests(step: Step) -> dict[str, float]:

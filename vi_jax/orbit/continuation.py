@@ -346,6 +346,11 @@ def _check_point(point: Point) -> None:
             "bifurcation at which something is touched, but is "
             f"{with_article(point.kind)}. {ADVICE}"
         )
+    if point.kind == FOLD and not is_defective(point.problem, point.step, 1.0):
+        raise ValueError(
+            "Argument `point` must not be a fold of two motions at once, as of equal machines "
+            "without coupling, but two multipliers are 1. Follow the fold of one of them."
+        )
     vanishes = point.kind in SLIDING and change_at(point.problem, point.step) is not None
     if point.kind in TOUCHING and not (point.touches or vanishes):
         raise ValueError(
@@ -390,6 +395,5 @@ def _special_motion(point: Point, parameter: str, bounds: Intervals) -> tuple[Sh
                 "Argument `parameter` must keep the symmetry, or other property, by which the "
                 f"branches cross, but they separate when {parameter} changes."
             )
-    double = point.kind == FOLD and not is_defective(point.problem, point.step, 1.0)
-    condition = Special(point.kind, impact, replacement, double=double)
+    condition = Special(point.kind, impact, replacement)
     return dataclasses.replace(problem, conditions=(condition,)), x

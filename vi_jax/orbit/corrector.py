@@ -22,8 +22,7 @@ from ..flow import simulate
 from ..machine import frequency_ratio, own_modes, phase_at, with_modes
 from .equations import Shooting, Unknowns
 from .results import ORBIT_RESULTS, Orbit
-from .root_finders import smallest_solution
-from .tolerances import CORRECTED, LISTED, LOCATED, ROUGHLY
+from .tolerances import CORRECTED, LISTED, ROUGHLY
 
 Vector = Float[Array, " n"]
 
@@ -90,10 +89,7 @@ def _advance(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, lengt
         y, before, count, *_ = carry
         jacobian, residual, _ = scaled_jacobian(equations, y)
         right_sides = jnp.stack([residual, jnp.zeros_like(y).at[-1].set(1.0)], axis=-1)
-        if problem.is_double:  # singular to first order in one direction
-            move, along = smallest_solution(jacobian, right_sides, LOCATED).T
-        else:
-            move, along = jnp.linalg.solve(jacobian, right_sides).T
+        move, along = jnp.linalg.solve(jacobian, right_sides).T
         size = jnp.max(jnp.abs(move))
         # One correction more than needed, so that the tangent is that of the solution. On a steep
         # curve rounding may keep all corrections above the tolerance.
@@ -148,10 +144,7 @@ def step_error(problem: Shooting, x: Unknowns) -> float:
 
 def tangent_at(problem: Shooting, x: np.ndarray) -> np.ndarray:
     """Return the scaled unit tangent of the solutions through `x`, last component positive."""
-    null = np.linalg.svd(jacobian_at(problem, x))[2]
-    tangent = null[-1]
-    if problem.is_double:  # one direction of the plane moves the parameters
-        tangent = np.linalg.svd(null[-2:, -2:])[0][:, 0] @ null[-2:]
+    tangent = np.linalg.svd(jacobian_at(problem, x))[2][-1]
     return tangent * np.copysign(1.0, tangent[-1])
 
 

@@ -396,10 +396,8 @@ class Boundary(Curve):
     """A curve in two parameters along which an orbit bifurcates. NumPy arrays with one row for each
     point, in order, in the machine's units (see `AbstractMachine.units`).
 
-    It ends on each side at the "bounds"; by "grazing" (an impact is gained or lost); by "rest" (a
-    rest is gained or lost); by "closed" (its last point is its first one); by "stalled",
-    "max_points" or "interrupted". A curve of Neimark–Sacker points also ends by "resonance-1:1" and
-    "resonance-1:2" (the two multipliers become real); a curve of motions without symmetry by
+    It ends as a `Branch` does. A curve of Neimark–Sacker points also ends by "resonance-1:1" and
+    "resonance-1:2" (the two multipliers become real), a curve of motions without symmetry by
     "symmetry-breaking" (they become symmetric).
     """
 

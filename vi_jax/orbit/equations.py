@@ -254,11 +254,6 @@ class Shooting(eqx.Module):
         )  # fmt: skip
 
     @property
-    def is_double(self) -> bool:
-        """True if these are the equations of a curve of double folds (see `Special`)."""
-        return any(getattr(condition, "double", False) for condition in self.conditions)
-
-    @property
     def contacts(self) -> tuple[tuple[float, ...], ...]:
         """`Flight.contact` of each coordinate in each leg; empty without rests."""
         if not self.landings:

@@ -11,8 +11,9 @@ from .local_map import LocalMap
 LONGEST, SOUGHT = 64, 192
 
 # A motion is periodic if it repeats within this share of one kick: a choice, far above the rest of
-# the transient (`_REMAINING`) and far below the differences of chaos.
-_REPEATS = 1e-3
+# the transient (`_REMAINING`) and far below the differences of chaos. A distant one is periodic
+# within the square of it.
+REPEATS = 1e-3
 
 # A motion beyond so many kicks does not return: a choice.
 _LOST = 1e9
@@ -76,7 +77,7 @@ def periods_in(rows: np.ndarray, hits: np.ndarray, size: np.ndarray) -> np.ndarr
     for p in range(LONGEST, 0, -1):
         differences = np.abs(rows[:, p:] - rows[:, :-p]).max(axis=(1, 2))
         same_hits = (hits[:, p:] == hits[:, :-p]).all(axis=1)
-        found = np.where(same_hits & (differences <= _REPEATS * size), p, found)
+        found = np.where(same_hits & (differences <= REPEATS * size), p, found)
     return found
 
 

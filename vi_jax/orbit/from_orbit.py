@@ -68,7 +68,7 @@ from .corrector import on_host, step_error
 from .equations import Shooting, Unknowns
 from .flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
 from .results import Orbit
-from .tolerances import CORRECTED, LISTED, LOCATED, ROUNDING
+from .tolerances import CORRECTED, LISTED, LOCATED, ROUGHLY, ROUNDING
 
 
 def has_fixed_steps(method: AbstractMethod) -> bool:
@@ -363,8 +363,8 @@ def events_in(orbit: Orbit) -> list[Placed]:
 
 
 # A machine is compared with itself a turn later and at another clock: at so many angles, after this
-# share of the period, with this largest relative difference. Choices.
-_AROUND, _LATER, _DIFFERS = 7, 0.37, 1e-8
+# share of the period. Choices.
+_AROUND, _LATER = 7, 0.37
 
 
 def _repeats_each_turn(orbit: Orbit) -> bool:
@@ -375,7 +375,7 @@ def _repeats_each_turn(orbit: Orbit) -> bool:
     machine, state = orbit.machine, without_modes(orbit.state)
     values = _rates_at(machine, state, modes_of(orbit.state), clocks, angles + turns)
     here, *others = np.asarray(values)
-    return bool((np.abs(others - here) <= _DIFFERS * np.abs(here).max(axis=0)).all())
+    return bool((np.abs(others - here) <= ROUGHLY * np.abs(here).max(axis=0)).all())
 
 
 @compiled
@@ -453,13 +453,11 @@ def event_numbers(machine: AbstractMachine, kind: np.ndarray, number: np.ndarray
 
 @on_host
 def _fly(blank: Shooting, steps, modes, s0, s1, u):
-    """Return the state at clock `s1`, from `u` at `s0`, without an event in between."""
     return Flight(blank.machine, modes, blank.method, blank.like).fly(s0, s1, u, steps)[0]
 
 
 @on_host
 def _jump(blank: Shooting, number: int, s, u, modes):
-    """Return the state and the modes after the event of this number."""
     after, modes = after_event(blank.machine, number, s, blank.unravel(u), modes)
     return ravel_pytree(after)[0], modes
 

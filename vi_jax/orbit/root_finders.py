@@ -30,12 +30,11 @@ def rounding(dtype: object) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.75
 
 
-def smallest_solution(matrix: Matrix, right_side: Array, threshold: float | None = None) -> Array:
-    """Return the smallest solution of `matrix @ step = right_side`; singular values below the
-    share `threshold` of the greatest are zero. `right_side - matrix @ step` is unreachable."""
+def smallest_solution(matrix: Matrix, right_side: Array) -> Array:
+    """Return the smallest solution of `matrix @ step = right_side`; `right_side - matrix @ step` is
+    unreachable."""
     left, sizes, right = svd(stop_gradient(matrix))
-    threshold = rounding(matrix.dtype) if threshold is None else threshold
-    is_zero = sizes <= threshold * jnp.minimum(sizes[0], _STEEP)
+    is_zero = sizes <= rounding(matrix.dtype) * jnp.minimum(sizes[0], _STEEP)
     size = jnp.where(sizes[0] > 0, sizes[0], 1.0)
     # Directions without an image get one, so that the matrix can be inverted.
     filled = (left * (is_zero.astype(matrix.dtype) * size)) @ right

@@ -43,7 +43,7 @@ from .locate import locate_zero
 from .results import Orbit
 from .sliding import change_at, without_part
 from .special import Point, point_at
-from .tolerances import LISTED, LOCATED
+from .tolerances import LISTED, LOCATED, ON_CIRCLE
 from .torus import Torus, torus_near
 
 _ORBIT = "orbit"
@@ -266,9 +266,9 @@ def _orbit_of_periods(n: int, point: Point, distance: float) -> Orbit:
 
 
 # The first step along a curve is this share of the distance; each further one is twice as long, so
-# many at most. With half the speed the found point is half as far off, within these bounds. A
-# resonance is zero to this share of the kick. Choices.
-_FIRST, _STEPS, _HALF, _RESONANT = 1e-3, 16, (0.35, 0.65), 1e-5
+# many at most. With half the speed the found point is half as far off, within these bounds.
+# Choices.
+_FIRST, _STEPS, _HALF = 1e-3, 16, (0.35, 0.65)
 
 
 def _point_near_resonance(kind: str, point: Point, distance: float) -> Point:
@@ -283,7 +283,7 @@ def _point_near_resonance(kind: str, point: Point, distance: float) -> Point:
         return float(np.linalg.norm(local.gradients[0]) * np.linalg.norm(remainder))
 
     periods = range(1, PERIODS + 1)
-    n = next((n for n in periods if abs(local.resonance(n, sign)) < _RESONANT * depth(n)), 1)
+    n = next((n for n in periods if abs(local.resonance(n, sign)) < ON_CIRCLE * depth(n)), 1)
     fastest = min(point.step.observed.fastest, np.sqrt(2 * touch.rate) * depth(n))
     whole = over_periods(problem, n)
     new, x = _with_touch(whole, repeated(problem, graze.x, whole), touch.number, touch.clock)

@@ -5,7 +5,8 @@ that did not, in 67 tests of branches, boundaries and grazings.
 """
 
 # The corrector's last correction, in scaled unknowns; a flight with enough steps changes by less.
-# On steep curves rounding keeps corrections above it, up to the second number.
+# On steep curves rounding keeps corrections above it, up to the second number. That is also the
+# accuracy of what is called resolved: a curve between its nodes, a motion that repeats, its steps.
 CORRECTED, ROUGHLY = 1e-11, 1e-8
 
 # A parameter or a guard is at a value to rounding: a choice, below the corrector's tolerance.
@@ -17,8 +18,13 @@ ROUNDING = 1e-9
 
 # Zero at a located point: the speed of an event that is lost (below 2e-14, above 7e-4), a touched
 # stop, the test of a bifurcation, the time between events that coincide. The corrector leaves up to
-# 5e-8 at the release from a soft stop that grazes.
+# 5e-8 at the release from a soft stop that grazes. A multiplier is on the unit circle within ten
+# times that.
 LOCATED = 1e-6
+ON_CIRCLE = 10 * LOCATED
+
+# Places closer in time than this (a cycle is 2π) are one: between them a motion turns by `LOCATED`.
+BRIEF = LOCATED**0.5
 
 # The distance of two solutions that are one motion, as where a curve closes (below 9e-13, above
 # 7e-5), or of a motion from its own repetition or image.

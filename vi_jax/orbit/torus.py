@@ -35,7 +35,7 @@ from ..machine import (
     with_modes,
     without_modes,
 )
-from .birkhoff import agreement, rotation_number, weights, without_angles
+from .birkhoff import QUASIPERIODIC, agreement, rotation_number, weights, without_angles
 from .corrector import on_host
 from .cycle_map import CycleMap, cycle_map, map_state
 from .equations import Observed, Shooting
@@ -50,7 +50,7 @@ from .from_orbit import (
 )
 from .results import Orbit
 from .special import Point
-from .tolerances import LISTED, ROUNDING, SAME
+from .tolerances import LISTED, ROUGHLY, ROUNDING, SAME
 from .torus_equations import (
     Curve,
     Equations,
@@ -62,18 +62,11 @@ from .torus_equations import (
     modes,
 )  # fmt: skip
 
-# A torus is resolved if tail and residual are below this number: a choice.
-RESOLVED = 1e-8
-
 # The first and the largest number of nodes.
 _FIRST, MOST = 33, 513
 
-# Averages that agree to fewer digits are not those of a quasi-periodic motion. Those of 35 tori of
-# an oscillator with a stop agreed to 5.3 and more over 2,048 cycles, those of chaos to 2.
-_DIGITS = 4.5
-
-# A motion repeats if sections so many cycles apart differ by less than this share: a choice.
-_REPEATS, _LONGEST = 1e-8, 512
+# A motion repeats if sections at most so many cycles apart agree: a choice.
+_LONGEST = 512
 
 # The curve through a run is near its sections, relative to their sizes: a choice.
 _NEAR = 0.1
@@ -202,14 +195,14 @@ class Torus:
         lowest = min(self.margins, key=lambda margin: margin.share)
         if first_mode(self.equations, self.curve)[1] < SAME:
             return "The curve has shrunk to a periodic motion, which any rotation number solves."
-        if self.tail > RESOLVED:
+        if self.tail > ROUGHLY:
             return (
                 f"The curve is not resolved by {self.nodes} nodes: its highest modes are "
                 f"{self.tail:.1g} of the largest. Use more `nodes`."
             )
         if lowest.crossed:
             return f"The motion has other events than the equations: {lowest}."
-        if not self.residual < RESOLVED:
+        if not self.residual < ROUGHLY:
             return (
                 f"Simulations leave the curve between its nodes, by {self.residual:.1g}. Use more "
                 "`nodes`, or a finer `method`."
@@ -316,7 +309,6 @@ def first_mode(equations: Equations, curve: Curve) -> tuple[np.ndarray, float]:
 
 @on_host
 def _mapped(map_and_equations: tuple[CycleMap, Shooting], rows):
-    """Return the states on the section after the period of a map, from states on it."""
     the_map, problem = map_and_equations
     return jax.vmap(lambda row: raveled(the_map(begin_on_section(problem, row)))[0])(rows)
 
@@ -468,7 +460,7 @@ def _measured_rotation(
     """Return the rotation number of a run that is quasi-periodic, else raise `ValueError`."""
     sizes = sizes_on_host(machine, like, rows)
     differences = (np.abs(rows[-1] - rows[-_LONGEST - 1 : -1]) / sizes).max(axis=1)[::-1]
-    repeats = np.flatnonzero(differences < _REPEATS)
+    repeats = np.flatnonzero(differences < ROUGHLY)
     if len(repeats):
         period = count_of(cycles * (int(repeats[0]) + 1), "cycle")
         raise ValueError(
@@ -477,7 +469,7 @@ def _measured_rotation(
         )
     seen = without_angles(jnp.asarray(rows), sizes, angles_in(machine, like))
     digits = float(agreement(seen))
-    if digits < _DIGITS:
+    if digits < QUASIPERIODIC:
         raise ValueError(
             "Argument `start` must settle on a quasi-periodic motion, but averages over both "
             f"halves of the run agree to {digits:.2g} digits only. A slowly settling motion needs "

@@ -16,11 +16,10 @@ from .find import find_orbit
 from .from_orbit import check_parameter
 from .kinds import GRAZING, TORUS
 from .results import Orbit
-from .tolerances import SAME
+from .tolerances import LOCATED, ROUGHLY, SAME
 from .torus import (
     MOST,
     REORDERED,
-    RESOLVED,
     Torus,
     first_mode,
     margins_of,
@@ -46,9 +45,9 @@ _SPURIOUS, _SHORTEST = 1e-3, 1e-2
 _REACH, _BACK = 2.0, 16
 
 # Angles at which the motions of a window are found, within the q-th part of a turn, odd. The high
-# modes of the parameter must be below this share of its range, or rounding. Its extrema, the
+# modes of the parameter must be below `LOCATED` of its range, or this rounding. Its extrema, the
 # window's ends, are sought at so many places. Choices.
-_ANGLES, _SMOOTH, _ROUNDING, _BETWEEN = 33, 1e-6, 1e-14, 8192
+_ANGLES, _ROUNDING, _BETWEEN = 33, 1e-14, 8192
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -86,11 +85,10 @@ class _End(NamedTuple):
 class TorusBranch:
     """A family of tori in one parameter, in order, from `continue_torus`.
 
-    It ends on each side at the "bounds"; by "grazing" (located: a stop is touched or an impact
-    lost); by "order" (two events, or an event and the section, change their order); by "resonance"
-    (the motion locks to a ratio p:q in a window that a step did not cross); by "coarse" (more nodes
-    are needed than allowed, as at a loss of smoothness); by "neimark-sacker" (the curve shrinks to
-    a periodic motion); by "stalled", "max_points" or "interrupted".
+    It ends as a `Branch` does, at a "grazing" that is located to rounding; by "order" (two events,
+    or an event and the section, change their order); by "resonance" (the motion locks to a ratio
+    p:q in a window that a step did not cross); by "coarse" (more nodes are needed than allowed, as
+    at a loss of smoothness); or by "neimark-sacker" (the curve shrinks to a periodic motion).
     """
 
     name: str
@@ -254,12 +252,11 @@ class _Walk:
         if equations.unit(new.tangent) @ equations.pack(ahead) < SAME_CURVE:
             return STALLED
         finer = equations.refined(new, self.most)
-        if finer is None or equations.tail(finer.curve) > RESOLVED:
+        if finer is None or equations.tail(finer.curve) > ROUGHLY:
             return COARSE
         return finer
 
     def _append(self, new: Solved) -> None:
-        """Add a torus, and the windows that lie before it."""
         here = self.points[-1].curve
         for p, q in _ratios(here.rotation, new.curve.rotation):
             share = (p / q - here.rotation) / (new.curve.rotation - here.rotation)
@@ -330,7 +327,7 @@ class _Walk:
         values = np.array([cycle.p[-1] for cycle in cycles])
         middle = values.mean()
         high = np.abs(np.fft.rfft(values))[_ANGLES // 3 :].max() / _ANGLES
-        if high > _SMOOTH * np.ptp(values) + _ROUNDING * abs(middle):
+        if high > LOCATED * np.ptp(values) + _ROUNDING * abs(middle):
             return unknown
         between = interpolated((values - middle)[:, None], angles_of(_BETWEEN))
         low, high = middle + between.min(), middle + between.max()

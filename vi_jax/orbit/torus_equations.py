@@ -25,14 +25,13 @@ from .._types import State
 from ..machine import own_modes, with_modes
 from .corrector import on_host, scaled_jacobian
 from .equations import Shooting
-from .tolerances import CORRECTED, ROUGHLY
+from .tolerances import CORRECTED, ROUGHLY, ROUNDING
 
 # Rows that a compiled program takes at once, a choice: fewer are filled up.
 _LANES = 64
 
-# The largest scaled component of the last correction (the next would be its square), if rounding
-# does not keep it above; the most corrections; the largest one that is made at once. Choices.
-_TOLERANCE, _MOST, _LONGEST = 1e-9, 14, 0.3
+# The most corrections, and the largest scaled component of one that is made at once. Choices.
+_MOST, _LONGEST = 14, 0.3
 
 # The tail of a spectrum are the modes above this share of the highest: a choice.
 _TAIL = 0.8
@@ -243,7 +242,8 @@ class Equations:
             size = max(np.abs(move.x / self.scale).max(), *np.abs(moves[0][move.x.size :]))
             share = min(1.0, _LONGEST / size) if size > 0 else 1.0
             curve = curve.plus(share, move)
-            if size <= _TOLERANCE or (before <= ROUGHLY and size >= before):
+            # The next correction would be the square, if rounding does not keep it above.
+            if size <= ROUNDING or (before <= ROUGHLY and size >= before):
                 return Solved(curve, count, tangent)
             before = size
         return None

@@ -13,11 +13,8 @@ from ..machine import after_event, events_of, guard_of, jump_of, stops_of
 from .corrector import on_host
 from .equations import Shooting
 from .flight import Event, Flight
-from .tolerances import LOCATED, ROUNDING
+from .tolerances import BRIEF, EXACT, LOCATED, ROUNDING
 from .turns import Path, turning_points
-
-# Error of the place of a touch, as a share of the state: a choice, ten times the promised one.
-_TOUCH_ERROR = 1e-12
 
 # Duration of the first contact in cycles; each further contact has a quarter of it; most contacts;
 # measured powers that agree within this have converged; steps of a flight. Choices.
@@ -62,7 +59,7 @@ def soft_kick(
     (field, change), (y, deepest) = fields(u), deepest_at(length)
     deep_change, sizes = fields(deepest)[1], np.asarray(problem.sizes)[1:]
     # A stiff stop pushes by rounding, up to the error of the touch's place.
-    place_error = _TOUCH_ERROR * np.abs(gradient) @ np.abs(u) / y**2
+    place_error = EXACT * np.abs(gradient) @ np.abs(u) / y**2
     largest = lambda rates: np.abs(rates / sizes).max()
     rounding = max(ROUNDING * largest(field), place_error * largest(deep_change))
     if largest(change) > rounding:
@@ -165,10 +162,6 @@ def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np
     return contact_flight(contact_end)[0] - free_end
 
 
-# Touches that are closer than this share of a period are one: the depth between them is then of the
-# order of `LOCATED`. A choice.
-_SEPARATE = 1e-3
-
 # Speed of approach, as a share of the motion's, at which rebounds are differentiated: laws that
 # depend on the speed are taken at this one. A choice.
 _SLOW = 1e-8
@@ -229,7 +222,7 @@ def find_touches(
             for event, _, known in found
             if event == other
         ]
-        if min(time_differences, default=period) > _SEPARATE * period:
+        if min(time_differences, default=period) > BRIEF * period:
             found.append((int(other), int(leg), place))
     return found
 

@@ -26,7 +26,7 @@ from .equations import Shooting
 from .from_orbit import COARSE, steps_depend_on_motion, with_finer_steps, with_grown_sizes
 from .locate import locate_zero
 from .special import Point
-from .tolerances import EXACT, LOCATED, SAME
+from .tolerances import EXACT, LOCATED, ROUGHLY, SAME
 
 # Reasons to end of every curve: Ctrl-C was pressed, the corrector fails, the curve closes, a bound.
 INTERRUPTED, STALLED, CLOSED, BOUNDS = "interrupted", "stalled", "closed", "bounds"
@@ -51,10 +51,6 @@ _STEADY = 3
 # Events within the first share of the way before a place coincide with it. An earlier event's test
 # must be below minus the second share of its first value: above errors near singular equations.
 _SHORT, _NOISE = 1e-4, 1e-3
-
-# A warning is given for points whose states change by more than this with twice the steps, if more
-# are not allowed. For a motor whose crank slowed to a fifth, with its first steps, it was 0.07.
-_WARN_ABOVE = 1e-8
 
 # A curve begins at the zero of a test that is at most this share of its value a step further on.
 _ZERO_AT_START = 1e-7
@@ -312,7 +308,7 @@ class _Walk:
 
     def _warn(self) -> None:
         error, value = self._worst
-        if error > _WARN_ABOVE:
+        if error > ROUGHLY:  # more steps are not allowed
             problem = self.table.problem
             warn(
                 f"The flights of this curve have {problem.steps} steps each, but at "

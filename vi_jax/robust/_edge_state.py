@@ -14,8 +14,10 @@ from ..orbit import Orbit, map_state
 from ._settling import (
     ELSEWHERE,
     INADMISSIBLE,
+    NEAR,
     RECORDED,
     RETURNS,
+    SAME,
     Row,
     Rows,
     Settling,
@@ -23,9 +25,9 @@ from ._settling import (
     settling_on,
 )
 
-# Two starts on both sides of the boundary are bisected to the first distance and followed until
-# they reach the second, relative to the motion's size: choices. The edge lies between them.
-_CLOSE, _APART = 1e-10, 1e-5
+# Two starts on both sides of the boundary are bisected to this distance, relative to the motion's
+# size, and followed until they are no longer the `SAME`: a choice. The edge lies between them.
+_CLOSE = 1e-10
 
 # Pieces of `RECORDED` cycles after which two neighbours are bisected again in any case: a choice.
 _PIECES = 16
@@ -34,9 +36,9 @@ _PIECES = 16
 # distance of a walk from its origin (1 for chaos, 0 for regular motions). Choices.
 _FEWEST, _CORRELATION = 200, 0.7
 
-# The edge's motion must recur to within the first for a search; the orbit found may be farther off
-# by the second factor. Choices; after a failed search the first becomes a tenth.
-_RECURRENCE, _NEAR = 1e-3, 10.0
+# For a search the edge's motion must recur to within `NEAR`, a tenth of that after a failed search;
+# the orbit found may be farther off by this factor. A choice.
+_FARTHER = 10.0
 
 
 class EdgeState(Summarized):
@@ -145,7 +147,7 @@ def track_edge(
 ) -> EdgeState:
     """Find the edge state between a start that returns and one that does not. Extend
     `section_states`."""
-    tolerance, section_states = _RECURRENCE, [] if section_states is None else section_states
+    tolerance, section_states = NEAR, [] if section_states is None else section_states
     for _ in range(rounds):
         inside, outside = settling.bisected(inside, outside, _CLOSE)
         pair, sections = _follow_pair(settling, np.stack([inside, outside]))
@@ -154,11 +156,10 @@ def track_edge(
         section_states.append(sections)
         report(1)
         inside, outside = pair
-        recurrence = _recurrence(
-            np.concatenate(section_states)[-4 * longest - 1 :], longest, tolerance, settling
-        )
-        if recurrence is not None:
-            orbit = settling.orbit_near(*recurrence, _NEAR * tolerance)
+        *before, last = np.concatenate(section_states)[-longest - 1 :]
+        near = settling.motion.between(np.array(before), last)[::-1] <= tolerance if before else []
+        if np.any(near):  # the motion has returned near to its state so many cycles before
+            orbit = settling.orbit_near(last, int(np.argmax(near)) + 1, _FARTHER * tolerance)
             if orbit is not None and not bool(orbit.stable):
                 return _described(settling, section_states, orbit)
             tolerance *= 0.1
@@ -171,7 +172,7 @@ def _follow_pair(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
     for _ in range(_PIECES):
         both = settling.section_states(pair, RECORDED)
         both[1] = settling.motion.near(both[1], both[0])
-        separated = np.flatnonzero(~(settling.motion.between(both[1], both[0]) <= _APART))  # or NaN
+        separated = np.flatnonzero(~(settling.motion.between(both[1], both[0]) <= SAME))  # or NaN
         end = separated[0] if separated.size else RECORDED
         end = end if np.isfinite(both[:, end]).all() else end - 1
         parts.append(both[:, 1 : end + 1].mean(axis=0))
@@ -179,16 +180,6 @@ def _follow_pair(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
         if separated.size:
             break
     return pair, np.concatenate(parts)
-
-
-def _recurrence(
-    section_states: Rows, longest: int, limit: float, settling: Settling
-) -> tuple[Row, int] | None:
-    """Return the last state if the motion has returned near to it, and the fewest cycles."""
-    last = section_states[-1]
-    distances = settling.motion.between(section_states[:-1], last)
-    near = np.flatnonzero(distances[::-1][:longest] <= limit)
-    return (last, int(near[0]) + 1) if near.size else None
 
 
 def _described(settling: Settling, section_states: list[Rows], orbit: Orbit | None) -> EdgeState:

@@ -30,16 +30,16 @@ from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, components, in_rows, state_in_words, units_of
 from ..orbit import Orbit, cycle_map
 from ._edge_state import EdgeState, track_edge
-from ._settling import ELSEWHERE, RETURNS, Row, Rows, Settling, images, settling_on
+from ._settling import ELSEWHERE, RETURNS, UNCHANGED, Row, Rows, Settling, images, settling_on
 
 Kicks = Float[np.ndarray, "..."]
 """Kicks, the components in the last axis."""
 
-# Points of a ray between two others in one program: a choice, three bits a round.
-_BETWEEN = 7
+# Bits by which a round narrows an exit, in one program; rounds before exits are compared. Choices.
+_BITS, _COARSE = 3, 7
 
-# Rounds that narrow the exits of rays before their comparison; most rounds of refinement. Choices.
-_COARSE, _FINE = 7, 17
+# Rounds that leave nothing between two numbers of double precision.
+_ALL_BITS = math.ceil(np.finfo(float).nmant / _BITS)
 
 # The rays grow to twice the length until one leaves, at most so many times.
 _DOUBLINGS = 12
@@ -129,7 +129,7 @@ def narrowed(settling: Settling, kick: Kick, found: Exits, rounds: int) -> Exits
     for _ in range(rounds):
         if not good.any() or np.all(outside - inside <= 4e-16 * outside):
             break
-        new = exits(settling, kick, directions, inside, outside, _BETWEEN + 1)
+        new = exits(settling, kick, directions, inside, outside, 2**_BITS)
         # The outer end of a bracket was judged before; a bracket without a change is kept.
         same = ~np.isfinite(new.outside)
         inside = np.where(same, inside, new.inside)
@@ -196,7 +196,7 @@ def refine_direction(
         around = _around(best[0], angle, rng)
         coarse = exits(settling, kick, around, 0.0, best[2] * (1 + angle**2), 2 * AROUND)
         # At so large an angle the norm changes by its square, or decreases.
-        rounds_here = min(_FINE, math.ceil(-math.log2(angle**2) / 3) + 1)
+        rounds_here = min(_ALL_BITS, math.ceil(-math.log2(angle**2) / _BITS) + 1)
         found = narrowed(settling, kick, coarse, max(1, rounds_here))
         if len(found.outside):
             i = int(np.argmin(found.outside))
@@ -221,8 +221,8 @@ def _around(unit: Row, angle: float, rng: np.random.Generator) -> Kicks:
 
 
 # Newton's method begins where the motion on the edge is this near to the saddle; it adds periods
-# until a kick moves by less than the second number, relative to its norm. Choices.
-_NEAR_SADDLE, _CONVERGED = 0.05, 1e-11
+# until a kick is `UNCHANGED`, relative to its norm. A choice.
+_NEAR_SADDLE = 0.05
 
 # A change below this, relative to the norm, is the method's error if it exceeds half the one
 # before: adaptive steps of 1e-11 leave some 1e-9 in a gradient. The kick is then final. A choice.
@@ -278,7 +278,7 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
 
 def _is_converged(change: float, last: float) -> bool:
     """Return whether a change, relative to the norm, is zero or within the method's error."""
-    return change <= _CONVERGED or last / 2 <= change <= _NOISE
+    return change <= UNCHANGED or last / 2 <= change <= _NOISE
 
 
 def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
@@ -342,12 +342,9 @@ _SAME = 1e-4
 # latter narrow a turn of 1/128 to 1e-8.
 _FEW_ROUNDS, _MANY_ROUNDS = 2, 14
 
-# Rounds of bisection by eight that leave nothing between two numbers of double precision.
-_ROUNDING = 18
-
-# Newton's kick may be longer than that of the rays by the first share, and shorter by the second:
-# otherwise it is another kick. A choice, for rays as dense as the default.
-_LONGER, _SHORTER = 1e-4, 0.05
+# Newton's kick may be shorter than that of the rays by this share, and not longer: otherwise it is
+# another kick. A choice, for rays as dense as the default.
+_SHORTER = 0.05
 
 # Most rounds of edge tracking.
 _ROUNDS = 40
@@ -509,7 +506,7 @@ def _exact(
     """Return the shortest kick near a ray that leaves the basin at a radius."""
     unit, inside, outside = refine_direction(settling, kick, unit, radius, angle, _FEW_ROUNDS, seed)
     line = Exits(unit[None], np.array([inside]), np.array([outside]))
-    line = narrowed(settling, kick, line, _ROUNDING)
+    line = narrowed(settling, kick, line, _ALL_BITS)
     outside = float(line.outside[0])
     ends = kick.rows(np.array([line.inside[0], outside * (1 + _MARGIN)])[:, None] * unit)
     if settling.begin > 0:
@@ -518,7 +515,7 @@ def _exact(
     if edge.kind == "saddle" and edge.orbit is not None:
         better = shortest(settling, kick, edge.orbit, unit * outside)
         longer = np.nan if better is None else np.linalg.norm(better[0]) / outside - 1
-        if better is not None and -_SHORTER <= longer <= _LONGER:
+        if better is not None and -_SHORTER <= longer <= _SAME:
             return *better, True, edge
     narrow = angle / NARROWER**_FEW_ROUNDS
     unit, inside, outside = refine_direction(

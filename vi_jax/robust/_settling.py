@@ -54,7 +54,7 @@ _LANES = 1024
 # the first has settled, or is nearer to an unstable one than starts can be distinguished. Section
 # states a period apart are the same within the second. An orbit found from a state is its motion if
 # it lies within the third. Choices.
-_UNCHANGED, _SAME, _NEAR = 1e-11, 1e-5, 1e-3
+UNCHANGED, SAME, NEAR = 1e-11, 1e-5, 1e-3
 
 # Sections of a motion that are recorded in one run. A choice: longer motions take several runs.
 RECORDED = 16
@@ -114,7 +114,7 @@ class Settling:
             if not done:
                 verdict[is_running & bad_start] = INADMISSIBLE
             # A repeating state has settled: more cycles cost time, and end an equilibrium in noise.
-            moves = (self.motion.between(later, rows) > _UNCHANGED) | (begin > 0)
+            moves = (self.motion.between(later, rows) > UNCHANGED) | (begin > 0)
             rows = np.where((is_running & good)[:, None], later, rows)
             is_running &= good
             returned = is_running.copy()
@@ -181,14 +181,14 @@ class Settling:
             return None
         rows = self.starting_at(0.0).section_states(last, 2 * longest)[0]
         for period in range(1, longest + 1):
-            if self.motion.between(rows[:-period], rows[period:]).max() <= _SAME:
+            if self.motion.between(rows[:-period], rows[period:]).max() <= SAME:
                 return rows[:period]
         return None
 
     def settled_orbit(self, start: Row, longest: int) -> Orbit | None:
         """Return the motion that a start settles on, made exact, or `None`."""
         rows = self.settled_rows(start, longest)
-        return None if rows is None else self.orbit_near(rows[0], len(rows), _NEAR)
+        return None if rows is None else self.orbit_near(rows[0], len(rows), NEAR)
 
     def orbit_near(self, row: Row, cycles: int, near: float) -> Orbit | None:
         """Return the periodic motion that a search from a state finds, if within `near` of it."""

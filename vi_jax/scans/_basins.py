@@ -242,7 +242,6 @@ class Basins(NamedTuple):
         return "\n".join(lines)
 
     def _reasons(self) -> str:
-        """Return the names of the reasons of failed starts."""
         failed = np.asarray(self.data["label"]) == int(REGIMES.failed)
         numbers = np.unique(np.asarray(self.data["result"])[failed]).astype(int)
         return ", ".join(REASON_NAMES[i] for i in numbers)
@@ -474,7 +473,6 @@ def _may_start(machine: AbstractMachine, begin: object, values: Mapping[str, flo
 def _check_options(
     verb: Callable[..., Any], options: Mapping[str, Any], refused: Iterable[str]
 ) -> None:
-    """Raise `TypeError` for an option that `scan` does not have, or that is `refused`."""
     function = verb.__name__
     parameters, of_scan = ({*inspect.signature(x).parameters} - {"options"} for x in (verb, scan))
     for name in options:
@@ -526,7 +524,6 @@ def starts_in(
 
 
 def _start_of_lane(data: "xr.Dataset", begin: State, lane: int) -> State:
-    """Return the start of a lane of a scan over starts."""
     names = [START + name for name in components(begin)]
     period, axes = data["period"], [name for name in names if name in data.coords]
     rows = {name: data[name].broadcast_like(period).transpose(*period.dims) for name in axes}
@@ -735,11 +732,8 @@ def _distance(
 ) -> float:
     """Return the distance of sections, relative to the widths, at the best shift in phase."""
     x, y = (np.stack([m.sections[name] for name in names], axis=1) for m in (a, b))
-    shifts = [n for n in range(len(y)) if _same_modes(a, b, n)]
+    modes = list(zip(a.modes, b.modes, strict=True))
+    shifts = (n for n in range(len(y)) if all((c == np.roll(d, n)).all() for c, d in modes))
     shifted = (np.roll(y, n, axis=0) for n in shifts)
     moves = ((np.abs(nearest_images(angles, x, z) - z) / widths).max() for z in shifted)
     return float(min(moves, default=np.inf))
-
-
-def _same_modes(a: Attractor, b: Attractor, shift: int) -> bool:
-    return all((x == np.roll(y, shift)).all() for x, y in zip(a.modes, b.modes, strict=True))

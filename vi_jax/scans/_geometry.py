@@ -116,7 +116,6 @@ def uncertainty_of(label: np.ndarray, *, is_start: np.ndarray | None = None) -> 
 
 
 def _power(distances: np.ndarray, fractions: np.ndarray) -> float:
-    """Return the exponent of the growth of the fractions with distance."""
     used = fractions > 0
     if used.sum() < 3:
         return np.nan

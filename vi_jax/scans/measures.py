@@ -28,23 +28,24 @@ from ..machine import (
     nearest_images,
     without_modes,
 )
-from ..orbit import agreement, rotation_number, without_angles
+from ..orbit import QUASIPERIODIC, WANDERS, agreement, rotation_number, without_angles
 from ._lyapunov import lyapunov, observe_growth
 
 # The largest difference of sections a period apart; its factor for the least period, if some period
 # fits; and the largest ratio of differences of two periods that fit. Choices.
 _TOLERANCE, _SLACK, _WORSE = 1e-6, 100.0, 1e4
 
-# The least tolerance of sections: multiples of their error by the method, and of rounding: choices.
-_WANDERS, _ROUNDINGS = 10.0, 64.0
+# The least tolerance of sections: `WANDERS` times their error by the method, with so many roundings
+# at least. A choice.
+_ROUNDINGS = 64.0
 
 
-# A motion is quasi-periodic if averages agree to more digits than the first number and the
-# logarithm of the growth of a perturbation over 2,048 cycles is below the second. Locked lanes had
-# 1 and more, tori up to 0.01. A motion is chaotic with fewer digits than the third number and more
-# growth than the fourth. Chaotic lanes had 8 and more, and those of a machine without losses up to
+# A motion is quasi-periodic if averages agree to more than `QUASIPERIODIC` digits and the logarithm
+# of the growth of a perturbation over 2,048 cycles is below the first number. Locked lanes had 1
+# and more, tori up to 0.01. A motion is chaotic with fewer digits than the second number and more
+# growth than the third. Chaotic lanes had 8 and more, and those of a machine without losses up to
 # 3: the weighted mean of the rate 1/t of a shear is 2.2. See the page of limits for other lanes.
-_DIGITS, _NEUTRAL, _FEW, _GROWS = 4.4, 0.1, 3.5, 6.0
+_NEUTRAL, _FEW, _GROWS = 0.1, 3.5, 6.0
 
 
 class REGIMES(IntEnum):
@@ -112,7 +113,7 @@ def least_period(
     """
     states = in_rows(sections).T
     noise = _noise(wander, states.dtype)
-    tolerance = jnp.maximum(_TOLERANCE, _WANDERS * noise) if tolerance is None else tolerance
+    tolerance = jnp.maximum(_TOLERANCE, WANDERS * noise) if tolerance is None else tolerance
     rows, size = jnp.concatenate([states, exact.astype(states.dtype)]), len(states)
     count = states.shape[1] - longest
     last = rows[:, longest:]
@@ -518,8 +519,8 @@ class Regime(AbstractMeasure):
         chaos = jnp.where(is_weak, REGIMES.unsettled, chaos)
         # A motion without losses that repeats after many cycles has digits and no growth, too.
         noise = _noise(self.wander, seen.nearest.dtype)
-        moves_on = seen.nearest > jnp.maximum(_TOLERANCE, _WANDERS * noise)
-        is_neutral = (seen.digits > _DIGITS) & (jnp.abs(growth) < _NEUTRAL)
+        moves_on = seen.nearest > jnp.maximum(_TOLERANCE, WANDERS * noise)
+        is_neutral = (seen.digits > QUASIPERIODIC) & (jnp.abs(growth) < _NEUTRAL)
         is_torus = seen.successful & is_neutral & moves_on
         torus = jnp.where(is_torus, REGIMES.quasiperiodic, before)
         is_chaos = seen.successful & (seen.digits < _FEW) & (growth > _GROWS)

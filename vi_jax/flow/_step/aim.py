@@ -27,7 +27,8 @@ from .trial import Path, Trial
 _BRIEF = 1e-3
 
 # The polynomial of a guard is evaluated at the ends of this many parts of the step. It is corrected
-# by stages that are no closer to its ends than this share. Choices.
+# by stages that are no closer to its ends than this share. Choices; the 15 heights between the ends
+# fit in a kernel's registers, without which a friction takes a fifth longer.
 _PARTS = 16
 _EDGE = 0.1
 
@@ -74,6 +75,7 @@ def crests(
     find = partial(_crest, plan, shares, h)
     stacked = jtu.tree_map(lambda *x: jnp.stack(x), *zip(ends, values, slack, strict=True))
 
+    @jax.jit  # so that its code is written once
     def quick_test(given: Sequence[Any]) -> Flag:
         x, inner, zero = given
         return may_be_above(x[:2], x[2:], inner, shares, zero)
@@ -106,7 +108,7 @@ def _crest(
     factor's greatest change from stage to stage is a margin."""
     x0, v0, x1, v1 = ends
     height0, rises, height1, falls = x0 - slack, h * v0, x1 - slack, h * v1
-    grid, inner = np.arange(_PARTS + 1) / _PARTS, _inner(shares)
+    grid, inner = np.arange(1, _PARTS) / _PARTS, _inner(shares)
 
     def cubic(theta: np.ndarray) -> Array:
         left = 1 - theta
@@ -123,7 +125,8 @@ def _crest(
         share = np.interp(grid, places, np.arange(len(inner))) - left
         margin = jnp.max(jnp.abs(err[1:] - err[:-1])) if len(inner) > 1 else jnp.abs(err[0])
         heights = heights + _bump(grid) * (err[left] + share * (err[right] - err[left]) + margin)
-    above, place = _first_top(heights, rises / _PARTS, falls / _PARTS)
+    ends = (height0, rises / _PARTS), (height1, falls / _PARTS)
+    above, place = _first_top(heights, *ends)
     first = jnp.min(jnp.where(values > slack, np.asarray(shares), 2.0))
     place = jnp.maximum(jnp.minimum(place, first), _BRIEF)
     return (above | (first < 1)) & _may_be_shortened(plan, h), place * h
@@ -142,15 +145,19 @@ def _inner(shares: tuple[float, ...]) -> list[int]:
     return [found[share] for share in sorted(found)]
 
 
-def _first_top(heights: Array, rise: Scalar, fall: Scalar) -> tuple[Flag, Scalar]:
+def _first_top(
+    heights: Array, begin: tuple[Scalar, Scalar], end: tuple[Scalar, Scalar]
+) -> tuple[Flag, Scalar]:
     """Return whether a curve is positive between its ends, and the first such place as a share. The
-    curve consists of parabolas through its heights at equal distances, ends included, and through
-    the slopes `rise` and `fall` at the ends, per distance."""
-    parts = heights.size - 1
-    before, here, after = heights[:-2], heights[1:-1], heights[2:]
-    bend, tilt = 2 * here - before - after, after - before
-    top = (here >= before) & (here >= after) & (bend > 0)
-    found = (here > 0) | top & (tilt * tilt > -8 * bend * here)
+    curve consists of parabolas through its heights at equal distances, between the ends and at
+    them, and through the slopes at the ends, per distance; `begin` and `end` are height and slope.
+    """
+    parts, (first, rise), (last, fall) = heights.size + 1, begin, end
+    before = jnp.concatenate([first[None], heights[:-1]])
+    after = jnp.concatenate([heights[1:], last[None]])
+    bend, tilt = 2 * heights - before - after, after - before
+    top = (heights >= before) & (heights >= after) & (bend > 0)
+    found = (heights > 0) | top & (tilt * tilt > -8 * bend * heights)
     at = np.arange(1, parts) + jnp.where(top, 0.5 * tilt / jnp.where(top, bend, 1.0), 0.0)
     place = jnp.min(jnp.where(found, at, parts + 1.0))
 
@@ -159,9 +166,9 @@ def _first_top(heights: Array, rise: Scalar, fall: Scalar) -> tuple[Flag, Scalar
         found = (slope > 0) & (slope < 2 * bend) & (slope * slope > -4 * bend * height)
         return jnp.where(found, slope / jnp.where(found, 2 * bend, 1.0), parts + 1.0)
 
-    place = jnp.minimum(place, top_near_end(heights[0], rise, heights[1]))
-    last = top_near_end(heights[-1], -fall, heights[-2])
-    place = jnp.minimum(place, jnp.where(last < parts, parts - last, parts + 1.0))
+    place = jnp.minimum(place, top_near_end(first, rise, heights[0]))
+    late = top_near_end(last, -fall, heights[-1])
+    place = jnp.minimum(place, jnp.where(late < parts, parts - late, parts + 1.0))
     return place < parts, place / parts
 
 

@@ -7,6 +7,7 @@ error of their integral over the step is added, and `aim.crests` finds where the
 """
 
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -202,12 +203,20 @@ def may_be_above(
 
     The top of a parabola between two places exceeds both by at most an eighth of its fall to the
     next place; a half of that fall is allowed here. If the function falls at the start of the step,
-    or rises at its end, it has no top there.
+    or rises at its end, it has no top there. Nor has it one in the middle of four falls in a row,
+    or of four rises.
     """
     (x0, v0), (x1, v1) = begin, end
     values = jnp.concatenate([x0[None], inner[np.argsort(shares)], x1[None]])
-    halves = 0.5 * jnp.abs(values[1:] - values[:-1])
-    within = jnp.any(values[1:-1] + jnp.maximum(halves[1:], halves[:-1]) > zero)
+    rises = values[1:] - values[:-1]
+    halves = 0.5 * jnp.abs(rises)
+    slopes = jnp.concatenate([v0[None], rises, v1[None]])
+    fours = [slice(n, slopes.size - 3 + n) for n in range(4)]
+    falling, rising = slopes <= 0, slopes >= 0
+    one_way = functools.reduce(operator.and_, (falling[x] for x in fours))
+    one_way = one_way | functools.reduce(operator.and_, (rising[x] for x in fours))
+    top = values[1:-1] + jnp.maximum(halves[1:], halves[:-1]) > zero
+    within = jnp.any(top & ~one_way)
     return within | (v0 > 0) & (x0 + halves[0] > zero) | (v1 < 0) & (x1 + halves[-1] > zero)
 
 
