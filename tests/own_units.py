@@ -81,7 +81,7 @@ class Rubbed(_InUnits):
 class Cushioned(_InUnits):
     """Soft stops on both sides."""
 
-    names, begins, value, bounds = ("x", "u", "P", "w"), (0.1, 0.2, 100.0, 0.0), 0.5, (0.3, 0.75)
+    names, begins, value, bounds = ("x", "u", "P", "w"), (0.1, 0.2, 100.0, 0.0), 0.5, (0.3, 0.9)
     linked = ((0, 1),)
     cycle = 2 * np.pi / 0.9
 

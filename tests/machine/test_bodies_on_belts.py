@@ -183,9 +183,10 @@ class Three(vi.Mechanical):
         ]
         stop = vi.RigidStop(self.gap, self.restitution, on="b")
         strikes = vi.RigidStop(self.gap, self.restitution, on=lambda q: q.c - q.b)
-        return {"three": rubs, "stop": (*rubs, stop), "bodies": (rubs[0], rubs[2], strikes)}[
-            self.kind
-        ]
+        return {
+            "three": rubs, "stop": (*rubs, stop), "two": (*rubs[:2], stop),
+            "bodies": (rubs[0], rubs[2], strikes),
+        }[self.kind]  # fmt: skip
 
     def force(self, t, q, v):
         drive = self.drive * jnp.cos(2 * self.w * t)
@@ -213,3 +214,100 @@ def test_static_ratios_and_impacts_on_belts(kind):
     )
     assert good and fine
     np.testing.assert_allclose(found, finer, rtol=0, atol=1e-8)
+
+
+class Coupled(Three):
+    """The same with a full mass matrix."""
+
+    off: Any = None
+
+    def mass(self, q):
+        o = self.off
+        return [[1.0, o[0], o[1]], [o[0], 0.8, o[2]], [o[1], o[2], 1.3]]
+
+
+def drawn(seed, n):
+    """Return the numbers of random machines `Coupled`."""
+    draw = np.random.default_rng(seed).uniform
+    off = draw(-0.15, 0.15, (n, 3))
+    given = dict(
+        w=draw(0.4, 1.5, n), levels=draw(0.05, 0.9, (n, 3)), ratios=draw(1.0, 1.5, (n, 3)),
+    )  # fmt: skip
+    size, drift = draw(0.05, 0.5, n), draw(-0.3, 0.3, n)
+    given |= dict(
+        drive=draw(0.2, 1.2, n), gap=draw(0.15, 0.6, n), restitution=draw(0.2, 0.9, n), off=off
+    )
+    given["belt"] = np.column_stack([size, drift, draw(0, 2 * np.pi, (n, 5))])
+    return given
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "lane", "expected"),
+    [
+        ("stop", 19, (0.228985331207, 0.162989054632, 0.047471110098)),
+        ("two", 240, (0.272481035319, -0.040766497928, -1.571574527273)),
+    ],
+)
+def test_a_body_that_rests_while_others_slip_leaves_its_stop(kind, lane, expected):
+    """Regressions: at rest the sign of a velocity of 1e-13 was taken for the direction of motion.
+    After the release, a turn was sought where none is."""
+    given = {name: x[[lane]] for name, x in drawn(1, 512).items()}
+    start = dict(a=0.1, b=0.1, c=0.05, v=dict(a=0.2))
+    found, good = ends(functools.partial(Coupled, kind=kind), given, 3, **start)
+    assert good
+    np.testing.assert_allclose(found[0], expected, rtol=0, atol=2e-9)
+
+
+class Averaged(Coupled):
+    def averages(self, t, z):
+        return dict(power=z.v.a * z.v.b, place=z.b, square=z.c**2 + z.a**2)
+
+
+def numbers_of(given, moved):
+    """Return all numbers of a run with derivatives, and the kinds and names of its events."""
+    w, drive, *levels, gap, restitution = moved
+    given = given | dict(w=w, drive=drive, gap=gap, restitution=restitution)
+    machine = Averaged(**given | dict(levels=jnp.stack([*levels, given["levels"][2]])), kind="stop")
+    start = machine.at(a=0.1, b=0.1, c=0.05, v=dict(a=0.2))
+    run = vi.simulate(
+        machine, start, 1, method=vi.FixedStep(steps_per_cycle=60), event_log=24, impact_log=24
+    )
+    log, impacts = run.event_log, run.impact_log
+    numbers = (
+        log.phase, run.averages, run.impact_energy, run.y_max, run.y_min, run.duration, run.last,
+        impacts.phase, impacts.speed, impacts.impulse,
+    )  # fmt: skip
+    found = jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(numbers)])
+    return jnp.nan_to_num(found), (log.kind, log.number, run.successful)
+
+
+@pytest.mark.slow
+def test_derivatives_of_logs_averages_and_energies():
+    """Each entry, along a direction of six parameters, forward beside Richardson differences, and a
+    sum of all in reverse."""
+    n, h = 8, 1e-4
+    given = jax.tree.map(jnp.asarray, drawn(7, n))
+    moved = [given[x] for x in ("w", "drive")], given["levels"].T[:2], [given["gap"]]
+    moved = jnp.stack([*moved[0], *moved[1], *moved[2], given["restitution"]], 1)
+    directions = 0.1 * np.random.default_rng(3).normal(size=moved.shape)
+
+    def derivatives(given, p, d):
+        at = functools.partial(numbers_of, given)
+        value, forward = jax.jvp(lambda p: at(p)[0], (p,), (d,))
+        weights = jnp.sin(1.0 + jnp.arange(value.size))
+        reverse = jax.grad(lambda p: weights @ at(p)[0])(p) @ d
+        return forward, reverse, weights @ forward, *jax.vmap(lambda t: at(p + t * d))(steps)
+
+    steps = jnp.array([h, -h, 0.5 * h, -0.5 * h])
+    forward, reverse, total, values, (kinds, numbers, good) = jax.tree.map(
+        np.asarray, jax.jit(jax.vmap(derivatives))(given, moved, directions)
+    )
+    alike = lambda x: (x == x[:, :1]).reshape(n, -1).all(1)
+    comparable = good.all(1) & alike(kinds) & alike(numbers)
+    assert comparable.sum() >= 6
+    coarse, fine = (values[:, i] - values[:, i + 1] for i in (0, 2))
+    expected = (4 * fine / h - coarse / (2 * h)) / 3
+    off = np.abs(forward - expected) / (1 + np.abs(expected))
+    assert off[comparable].max() < 1e-6
+    np.testing.assert_allclose(reverse, total, rtol=1e-10, atol=1e-10)

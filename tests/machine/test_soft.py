@@ -1,5 +1,7 @@
 """Compliant stops: restitution in closed form, every law against SciPy, the rigid limit."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -297,3 +299,48 @@ def test_buffer_between_bodies_matches_closed_form(by_share):
     np.testing.assert_allclose(b - a, 2 * kept, rtol=1e-8)
     with pytest.raises(ValueError, match="`dashpot` belongs to a `PowerLaw`"):
         vi.SoftStop(0.1, 900.0, dashpot=1.0, law=vi.HuntCrossley())
+
+
+class Shaken(vi.Mechanical):
+    """A body on a spring with a stop that does not pull, in a unit of length."""
+
+    q, mass, cycle = ("x",), (1.0,), 2 * jnp.pi
+    stiffness: Any = 1.0
+    unit: Any = 1.0
+    law: vi.AbstractContactLaw = eqx.field(static=True, default=vi.PowerLaw())
+    is_rigid: bool = eqx.field(static=True, default=False)
+
+    @property
+    def contacts(self):
+        if self.is_rigid:
+            return vi.RigidStop(0.6 * self.unit, 0.7, on="x")
+        more = {"restitution": 0.7, "adhesive": False, "law": self.law, "on": "x"}
+        return vi.SoftStop(0.6 * self.unit, self.stiffness, **more)
+
+    def force(self, t, q, v):
+        return dict(x=1.3 * self.unit * jnp.cos(t) - 0.5 * q.x - 0.1 * v.x)
+
+
+def ends_of(stiffness, units, **options):
+    def end(stiffness, unit):
+        machine = Shaken(stiffness, unit, **options)
+        run = vi.simulate(machine, machine.at(), 2)
+        return jnp.where(run.successful, run.last.x / unit, jnp.nan)
+
+    given = jnp.broadcast_arrays(jnp.asarray(stiffness), jnp.asarray(units))
+    return np.asarray(jax.jit(jax.vmap(end))(*given))
+
+
+def test_a_stiff_stop_without_pull_is_a_rigid_one():
+    """Regressions: the pull, with the stiffness in its unit, was compared with the depth. Ends were
+    off by 1e-3 at a stiffness of 1e10, and the body passed the stop in single precision."""
+    rigid = ends_of(1.0, [1.0], is_rigid=True)
+    units = np.array([1.0, 1e6, 1e-6])
+    low, high = ends_of(1e8, units), ends_of(1e10, units)
+    # A contact lasts as long as the root of the compliance.
+    np.testing.assert_allclose((10 * high - low) / 9, rigid[0], rtol=0, atol=1e-7)
+    exact = ends_of(1e6, units)
+    np.testing.assert_allclose(exact, exact[0], rtol=0, atol=1e-9)
+    with jax.enable_x64(False):
+        single = ends_of(1e6, units)
+    np.testing.assert_allclose(single, exact, rtol=0, atol=1e-3)

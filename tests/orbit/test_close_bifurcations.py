@@ -52,7 +52,9 @@ class Bubbles(Bubble):
 def test_two_points_of_codimension_two_within_a_step():
     orbit = vi.find_orbit(Bubbles(0.25, 0.0), at(0.5, 0.0), throw=True)
     branch = vi.continue_orbit(orbit, parameter="a", bounds=(-1.0, 1.0), progress=False)
-    (fold,) = branch.special
+    fold, doubling = branch.special
+    assert doubling.kind == "period-doubling" and abs(doubling.parameter - 1) < 1e-15  # a bound
+    assert len(branch.at(1.0)) == 2 and set(branch.parameter[[0, -1]]) == {1.0}
     curve = vi.boundary(fold, parameter="b", bounds=((-1.0, 1.0), (-1.0, 1.0)), progress=False)
     assert [point.kind for point in curve.special] == ["fold-flip"] * 2
     places = np.array([point.parameters for point in curve.special])

@@ -107,6 +107,16 @@ def test_resonant_grazings_of_a_linear_oscillator(monkeypatch):
     again = module.points_of(curve.problem, curve.steps, curve.ends)
     assert [point.parameters[1] for point in again] == [p.parameters[1] for p in curve.special]
 
+    # Nor does a test that is exactly zero at a step.
+    resonance = module.LocalMap.resonance
+    rounded = lambda *given: x if abs(x := resonance(*given)) > 1e-12 else 0.0
+    monkeypatch.setattr(module, "graze_at", graze_at)
+    monkeypatch.setattr(module.LocalMap, "resonance", rounded)
+    exact = [step for _, step, _ in module._resonant_grazings(curve.problem, None, curve.steps)]
+    steps = sorted([*curve.steps, *exact], key=lambda step: step.x[-2])
+    again = module.points_of(curve.problem, steps, curve.ends)
+    assert len([point for point in again if point.kind == "resonant-grazing"]) == 5
+
 
 @pytest.mark.parametrize(
     ("to", "frequency", "force", "speed"),

@@ -107,3 +107,71 @@ def test_an_event_reaches_the_end_of_a_chatter():
     (point,) = branch.special
     assert point.parameter == pytest.approx(0.5 * np.pi - 0.6 * 1.1788045220098, abs=1e-7)
     assert "(the end of the chatter on the right stop and switch 0, at clock 1.439" in point.detail
+
+
+class Pressed(vi.Mechanical):
+    """A body that a constant force presses on a stop, and a vibration lifts for a part of a cycle
+    if its amplitude is greater."""
+
+    q, mass, cycle = ("x",), (1.0,), 2 * np.pi
+    amplitude: float = 0.6
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(0.0, 0.4, on="x")
+
+    def force(self, t, q, v):
+        return dict(x=0.5 + self.amplitude * jnp.cos(t) - q.x - 0.2 * v.x)
+
+
+@pytest.mark.slow
+def test_a_rest_that_joins_itself():
+    """Regression: the motion beyond was one without rest, which does not exist."""
+    machine = Pressed()
+    settled = vi.simulate(machine, machine.at(x=-0.1), 1, settle=40, rests=True).last
+    orbit = vi.find_orbit(machine, settled, throw=True)
+    options = {"parameter": "amplitude", "bounds": (0.2, 0.7), "progress": False}
+    branch = vi.continue_orbit(orbit, **options)
+    point = next(x for x in branch.special if x.kind == "rest")
+    assert point.parameter == pytest.approx(0.5, abs=1e-6) and "lasts for ever" in point.detail
+    always = vi.continue_orbit(point.switch(), **options)
+    (divided,) = always.special
+    assert set(always.ends) == {"bounds", "rest"} and always.parameter.min() == 0.2
+    assert divided.parameter == pytest.approx(0.5, abs=1e-9)
+    assert int(divided.switch().rests) == 1
+
+
+class Dragging(vi.Mechanical):
+    """A driven pendulum that is pressed on a stop and drags a stiffening spring."""
+
+    q, mass = ("x", "y"), (1.0, 0.6)
+    amplitude: float = 1.5780551531102542
+    gap, restitution, push = -0.15138035578735687, 0.5770427091485174, 0.08617047024737454
+    frequency = 0.5732534975700999
+    cycle = 2 * np.pi / frequency
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(self.gap, self.restitution, on="x")
+
+    def force(self, t, q, v):
+        spring = 0.35 * (q.x - q.y) + 0.04 * (v.x - v.y)
+        drive = jnp.cos(self.frequency * t) + 0.3 * jnp.sin(2 * self.frequency * t)
+        return dict(
+            x=self.push + self.amplitude * drive - jnp.sin(q.x) - 0.08 * v.x - spring,
+            y=spring - 0.9 * q.y - 0.3 * q.y**3 - 0.05 * v.y,
+        )
+
+
+@pytest.mark.slow
+def test_the_motion_beyond_a_rest_is_as_accurate_as_the_branch():
+    """Regression: it was sought with fewer steps, and did not repeat by 5e-6."""
+    machine = Dragging()
+    settled = vi.simulate(machine, machine.at(x=-0.6), 3, settle=300, rests=True).last
+    orbit = vi.find_orbit(machine, settled, cycles=3, throw=True)
+    branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=(0.947, 2.209), progress=False)
+    lost = min((x for x in branch.special if x.kind == "rest"), key=lambda x: x.parameter)
+    beyond = lost.switch(distance=0.005)
+    last = vi.simulate(beyond.machine, beyond.state, 3).last
+    assert beyond.rests == 0 and beyond.impacts == 11
+    np.testing.assert_allclose(last.x, beyond.state.x, rtol=0, atol=1e-7)

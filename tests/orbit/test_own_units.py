@@ -1,12 +1,14 @@
 """The unit of each component, the section and the order of events do not change orbits and
 branches."""
 
+import functools
+
 import jax
 import numpy as np
 import pytest
 import vi_jax as vi
 
-from own_units import MACHINES, Colliding, Cranked, Pair, Struck, variants
+from own_units import MACHINES, Colliding, Cranked, Cushioned, Pair, Struck, variants
 
 pytestmark = pytest.mark.slow
 
@@ -48,12 +50,17 @@ def test_orbits_in_single_precision(kind):
         assert_same_orbits(kind, 2e-3)
 
 
+@functools.cache
 def branches(kind):
-    """Yield the branch of each variant, and the variant in words."""
-    for machine in variants(kind):
-        orbit = found_by(machine)
-        branch = vi.continue_orbit(orbit, parameter="p", bounds=kind.bounds, progress=False)
-        yield branch, f"{machine.scales} {machine.phase} {machine.is_flipped}"
+    """Return the branch of each variant, and the variant in words."""
+    options = {"parameter": "p", "bounds": kind.bounds, "progress": False}
+    return [
+        (
+            vi.continue_orbit(found_by(machine), **options),
+            f"{machine.scales} {machine.phase} {machine.is_flipped}",
+        )
+        for machine in variants(kind)
+    ]
 
 
 @pytest.mark.parametrize("kind", MACHINES)
@@ -65,7 +72,7 @@ def test_branches(kind):
         assert found == first, case
 
 
-@pytest.mark.parametrize("kind", [Struck, Pair, Colliding, Cranked])
+@pytest.mark.parametrize("kind", [Struck, Pair, Colliding, Cranked, Cushioned])
 def test_local_maps(kind):
     first = None
     for branch, case in branches(kind):
@@ -75,4 +82,6 @@ def test_local_maps(kind):
         found = graze.touched.split()[0], str(graze.outcome), graze.forecast.period.tolist()
         first = first or (found, entries)
         assert found == first[0], case
-        np.testing.assert_allclose(entries, first[1], rtol=0, atol=1e-6)
+        # The kick of a soft stop is that of brief contacts, in which rounding is larger.
+        atol = 1e-5 if kind is Cushioned else 1e-6
+        np.testing.assert_allclose(entries, first[1], rtol=0, atol=atol)

@@ -155,10 +155,14 @@ def test_watch_locates_the_zero_of_a_function():
     scene = vi.Scene.ideal(frequency_ratio=0.31, restitution=0.76, gap=9.0, damping_ratio=0.25)
     orbit = vi.find_orbit(scene, scene.start(), throw=True)
     options = {"parameter": "drive.frequency_ratio", "bounds": (0.1, 0.9), "progress": False}
-    branch = vi.continue_orbit(
-        orbit, watch={"amplitude": lambda orbit: orbit.y_max - 1.3}, **options
-    )
-    (point,) = branch.special
+    watched = {
+        "amplitude": lambda orbit: orbit.y_max - 1.3,
+        "begin": lambda orbit: orbit.machine.drive.frequency_ratio - 0.31,
+    }
+    branch = vi.continue_orbit(orbit, watch=watched, **options)
+    begin, point = branch.special
+    assert (begin.quantity, begin.parameter) == ("begin", 0.31)
+    assert len(branch.at(0.31)) == 1 and branch.parameter[begin.index] == 0.31
     amplitude = 1 / np.hypot(1 - point.parameter**2, 0.5 * point.parameter)
     assert (point.kind, point.quantity) == ("watched", "amplitude")
     assert amplitude == pytest.approx(1.3, abs=1e-12)

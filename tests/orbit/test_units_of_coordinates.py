@@ -37,6 +37,18 @@ class Uncoupled(vi.Mechanical):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_clearance_of_the_nearest_stop(unit):
+    """It is that of the stop that is nearest as a share of the motion, here the second body's."""
+    machine = Uncoupled(unit)
+    orbit = vi.find_orbit(machine, machine.at(), throw=True)
+    bounds = (0.1, 0.7)
+    branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=bounds, progress=False)
+    swing = branch.parameter / np.hypot(1 - OMEGA**2, 0.3 * OMEGA)
+    np.testing.assert_allclose(branch.clearance, 1 - swing, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
 def test_local_map_of_a_grazing():
     """The motion is linear up to the touch, whose kick changes the velocity of x alone."""
     grazes = np.hypot(1 - OMEGA**2, 0.3 * OMEGA)

@@ -35,9 +35,7 @@ def test_sweeps(kind):
     assert_same_sweeps(kind)
 
 
-@pytest.mark.parametrize(
-    "kind", [x for x in MACHINES if x not in (Belted, Cranked, Cushioned, Heater)]
-)
+@pytest.mark.parametrize("kind", [x for x in MACHINES if x not in (Belted, Cranked, Cushioned)])
 def test_sweeps_in_single_precision(kind):
     """The others have long transients or motions without a period. The body on a belt comes to
     rest on its section, where in single precision a lane may end."""

@@ -190,7 +190,8 @@ def extents_of(
             k = stops_of(machine)[event.stop].coordinate
             rest = (*contact[:k], jnp.full_like(s, 1.0 + event.stop), *contact[k + 1 :])
         mode = mode_number(machine, number)
-        both_modes = ((*modes[:mode], jnp.full_like(s, x), *modes[mode + 1 :]) for x in (1.0, 0.0))
+        values = (jnp.full_like(s, x) for x in event.sized_in)
+        both_modes = ((*modes[:mode], x, *modes[mode + 1 :]) for x in values)
         extents.append(tuple(of_guard(number, x, rest) for x in both_modes))
     return stop_gradient(tuple(extents))
 

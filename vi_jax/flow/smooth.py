@@ -1,6 +1,8 @@
 """The smooth machine of one step, with fixed modes and held bodies; and integrals along its motion,
 on which the motion does not depend."""
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -25,6 +27,7 @@ from ..machine import (
     limited_in,
     push_of,
     shown_modes,
+    switches_of,
     velocity_change,
 )
 
@@ -58,7 +61,12 @@ class SmoothMachine(eqx.Module):
         """Return the same as `field`, traced inline."""
         machine, flow = self.machine, field_in(self.machine, s, state, self.modes)
         if holds_anywhere(machine) or (self.contact and not self._holds_one):
-            flow = constrained_rate(machine, flow, s, state, self.modes, self.contact)[0]
+            sticks = (self.modes[i] == 0 for i, x in enumerate(switches_of(machine)) if x.is_dry)
+            holds = functools.reduce(operator.or_, (*sticks, *(x > 0 for x in self.contact)))
+            held = lambda flow: constrained_rate(machine, flow, s, state, self.modes, self.contact)[
+                0
+            ]
+            flow = jax.lax.cond(stop_gradient(holds), held, lambda flow: flow, flow)
         return self._with_one_held(state, flow) if self._holds_one else flow
 
     @property

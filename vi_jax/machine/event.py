@@ -84,6 +84,11 @@ class AbstractEvent(Shown):
         `sides(machine, s, state, *modes)`; by default the guard alone."""
         return (self.guard(*args, **kwargs),)
 
+    def guard_into(self, new: Scalar, *args: Any, **kwargs: Any) -> Scalar:
+        """Return the guard of a change into the mode `new`, if the guard is the largest of several
+        functions: that one which is zero at this change. By default return `guard`."""
+        return self.guard(*args, **kwargs)
+
     @abc.abstractmethod
     def after(self, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
         """Return state and modes after the event: `after(machine, s, state, *modes)`."""
@@ -139,6 +144,8 @@ class AbstractSwitch(AbstractEvent):
     may_slide: ClassVar[bool] = True  # the mode differs on either side of the surface
     friction_stop: ClassVar[int | None] = None
     """The index of the stop on which this is friction, also in impacts (see `ContactFriction`)."""
+    sized_in: ClassVar[tuple[float, float]] = (1.0, 0.0)
+    """The modes in which the guard has the size of that in any other mode, and in mode 0."""
     blends: ClassVar[bool] = False
     """True if the motion may slide along the surface in mode 0. Its field there is a weighted mean
     of the fields of modes -1 and +1 (see `Switch`)."""

@@ -49,10 +49,13 @@ def section_number(machine: Machine) -> int:
 
 def guard_of(
     machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = (),
-    loads: Any = None,
+    loads: Any = None, new: Modes | None = None,
 ) -> Scalar:  # fmt: skip
-    """Return the guard of an event, which rises through zero where the event happens."""
+    """Return the guard of an event, which rises through zero where the event happens. If the modes
+    `new` after a change of a mode are known, the guard is a smooth function."""
     event, part, keywords = event_of(machine, number, modes, contact, loads)
+    if event.holds_mode and new is not None:
+        return event.guard_into(new[part.start], machine, s, state, *modes[part], **keywords)
     return event.guard(machine, s, state, *modes[part], **keywords)
 
 

@@ -7,10 +7,12 @@ from math import pi, sqrt
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
+from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from .._checks import (
@@ -405,6 +407,7 @@ class SoftStop(Wall, AbstractSwitch):
     coordinate: int = eqx.field(static=True)
     ends: str = eqx.field(static=True, init=False, default="")  # its touch ends no motion
     word: ClassVar = "soft stop"
+    sized_in: ClassVar = (APART, APART)  # all guards are lengths, as the depth
     checked_within_step: ClassVar = (
         False  # steps are short compared with a contact (`longest_step`)
     )
@@ -500,12 +503,20 @@ class SoftStop(Wall, AbstractSwitch):
         return jnp.where(inside, mode, APART)
 
     def guard(self, machine, s, state, mode):
+        if self.adhesive:
+            return -mode * self.depth(machine, state)[0]
+        to_apart, to_other = (
+            self.guard_into(x, machine, s, state, mode) for x in (APART, TOUCHING)
+        )
+        return jnp.maximum(to_apart, to_other)
+
+    def guard_into(self, new, machine, s, state, mode):
         depth, _ = self.depth(machine, state)
         if self.adhesive:
             return -mode * depth
         pulls = self._pulls(machine, s, state)
         ends = jnp.where(mode > 0, pulls, -pulls)
-        return jnp.where(mode < 0, depth, jnp.maximum(ends, -depth))
+        return jnp.where(mode < 0, depth, jnp.where(new < 0, -depth, ends))
 
     def after(self, machine, s, state, mode):
         if self.adhesive:
@@ -513,8 +524,8 @@ class SoftStop(Wall, AbstractSwitch):
         depth, _ = self.depth(machine, state)
         pulls = self._pulls(machine, s, state)
         inside = depth > 0  # without damping the force vanishes as the body comes out
-        released = jnp.where(inside & (pulls >= -depth), RELEASED, APART)
-        touching = jnp.where(inside & (-pulls > -depth), TOUCHING, APART)
+        released = jnp.where(inside & (pulls >= -0.5 * depth), RELEASED, APART)
+        touching = jnp.where(inside & (pulls < 0.5 * depth), TOUCHING, APART)
         return state, jnp.where(mode < 0, TOUCHING, jnp.where(mode > 0, released, touching))
 
     def longest_step(self, machine: Machine, s: Scalar, state: State) -> Any:
@@ -538,8 +549,14 @@ class SoftStop(Wall, AbstractSwitch):
         )
 
     def _pulls(self, machine: Machine, s: Scalar, state: State) -> Any:
-        damping = self._damping(self._mass(machine, s, state))
-        return self.law.pulls(self.stiffness, damping, self.prestress, *self.depth(machine, state))
+        """Return the pull as a length: it is compared with the depth, and has the same rounding."""
+        mass, (depth, rate) = self._mass(machine, s, state), self.depth(machine, state)
+        given = self.stiffness, self._damping(mass), self.prestress
+        pulls, slopes = jax.value_and_grad(self.law.pulls, argnums=(3, 4))(*given, depth, rate)
+        stiffness = self.stiffness if _is_one(mass) else self.stiffness / mass
+        frequency = self.law.frequency(stiffness, depth, rate)
+        unit = stop_gradient(jnp.abs(slopes[0]) + frequency * jnp.abs(slopes[1]))
+        return jnp.where(unit > 0, pulls / jnp.where(unit > 0, unit, 1.0), -depth)
 
 
 def _is_one(mass: Any) -> bool:

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from ..machine import stops_of
 from .conditions import HeldMultiplier, bifurcation_tests, in_one_parameter, rates_at
 from .corrector import Step, advance, distance_along, orbit_of
 from .edit_events import (
@@ -56,7 +57,7 @@ from .kinds import (
     TURNS,
     WATCHED,
 )
-from .locate import SPACING, crossing, dip_of
+from .locate import SPACING, crossing, dip_of, passes_zero
 from .results import Orbit
 from .sliding import change_at, locate_change
 from .special import Point, further_of, point_at
@@ -155,7 +156,12 @@ class MotionTable(Table):
         place = place_in_words(self.problem, at, clock)
         detail = f"two rests on a stop become one: the body no longer leaves it {place}"
         old, at = in_one_parameter(self.problem, at)
-        new, x = without_events(old, at.x, both)
+        (number, *_), (new, x) = old.events[release], without_events(old, at.x, both)
+        if all(event.number != number for event in new.events):  # a rest joins itself
+            detail = f"a rest on a stop lasts for ever: the body no longer leaves it {place}"
+            held = list(old.held) or [0.0] * len(old.machine.coordinates)
+            held[stops_of(old.machine)[number].coordinate] = 1.0 + number
+            new = dataclasses.replace(new, held=tuple(held))
         at = advance(new, x, np.eye(x.size)[-1], 0.0)
         return point_at(new, at, REST, detail, is_origin=True)
 
@@ -272,12 +278,17 @@ class MotionTable(Table):
     def _zeros(self, here: Step, last: Step) -> Iterator[tuple[Point, Step]]:
         """Yield local extrema of quantities, and zeros of watched functions."""
         known_x, before = self._last_numbers
+        is_first = not before
         before = before if np.array_equal(known_x, here.x) else self._numbers(here)
         self._last_numbers = last.x, self._numbers(last)
         for (kind, name), (value, begin) in before.items():
             other, end = self._last_numbers[1][kind, name]
             steep, least = max(abs(begin), abs(end)), ROUNDING * max(abs(value), abs(other))
-            if not begin * end < 0 or (kind == EXTREMUM and steep <= least):
+            # A zero at the first motion counts on the way on which the function falls.
+            starts_at_zero = is_first and kind == WATCHED and begin == 0 > end
+            if not (starts_at_zero or passes_zero(begin, end)):
+                continue
+            if kind == EXTREMUM and steep <= least:
                 continue
             at = self.locate_zero(here, last, lambda s, k=(kind, name): self._numbers(s)[k][1])
             if at is None:
@@ -468,7 +479,7 @@ def _changed_tests(here: Step, last: Step, *, held: bool) -> list[str]:
     motion are `held`, the two are independent.
     """
     before, after = bifurcation_tests(here), bifurcation_tests(last)
-    changed = [kind for kind in before if before[kind] * after[kind] < 0]
+    changed = [kind for kind in before if passes_zero(before[kind], after[kind])]
     # Without damping a pair stays on the unit circle, to rounding of either sign.
     if TORUS in changed and max(abs(before[TORUS]), abs(after[TORUS])) < ROUNDING:
         changed.remove(TORUS)

@@ -36,7 +36,7 @@ from .kinds import (
     TOUCHING,
 )
 from .local_map import LocalMap, graze_at
-from .locate import crossing, dip_of, locate_zero
+from .locate import crossing, dip_of, locate_zero, passes_zero
 from .special import Point, point_at
 from .tolerances import ALIKE, LOCATED
 from .touch import NoLocalMapError
@@ -145,7 +145,7 @@ def _resonant_grazings(
         test = lambda step, resonance=resonance: resonance(local(step))
         values = [resonance(each) for each in maps]
         for i, (before, after) in enumerate(itertools.pairwise(values)):
-            if not before * after < 0:
+            if not passes_zero(before, after):
                 continue
             step = locate_zero(problem, steps[i], steps[i + 1], test)
             if step is None or not bool(step.good):
@@ -273,7 +273,7 @@ def _zeros(problem: Shooting, steps: list[Step], test: Test) -> Iterator[tuple[f
         near, known = steps[i - 1 : i + 2], [x for x, _ in tested[i - 1 : i + 2]]
         if i and (middle := _dip(problem, near, known, value)) is not None:
             ends = [(here, middle), (new, middle)]
-        elif not (before * after < 0 or (after == 0 and before != 0)):
+        elif not passes_zero(before, after):
             continue
         for pair in ends:
             at = _zero(problem, *pair, value, scale)

@@ -146,7 +146,8 @@ class Curve(abc.ABC):
 
     @cached_property
     def clearance(self) -> np.ndarray:
-        """Smallest distance to a stop at a turn that does not touch it."""
+        """Smallest distance to a stop at a turn that does not touch it: of several stops as a share
+        of the motion's size there."""
         return self._stack(lambda observed: observed.nearest.margin)
 
     @cached_property

@@ -376,10 +376,10 @@ class Shooting(eqx.Module):
     def guard(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
         """Return g(s, u), which is zero and rising at the event that begins a leg."""
 
-        before = self.flight(machine, leg - 1)
+        before, modes = self.flight(machine, leg - 1), self.modes_in(leg)
 
         def value(event, s, u):
-            return guard_at(before, event, s, self.unravel(u))
+            return guard_at(before, event, s, self.unravel(u), modes)
 
         return self._for_event(leg, value, s, u)
 
@@ -576,8 +576,8 @@ class Shooting(eqx.Module):
             positions = [machine.position(self.unravel(x)) for x in (u, after)]
             h = (s1 - begin.s) / self.steps
             flight = self.flight(machine, leg)
-            turns = turns_of(Path(flight, path[0], path[1], h, not self.events))
             sizes = self.guard_sizes(flight, s0, after)
+            turns = turns_of(Path(flight, path[0], path[1], h, not self.events), sizes)
             largest = jnp.max(jnp.abs(path[1]), axis=0)
             return matrix, integrals, approach, agree, turns, positions, largest, begin, sizes
 
@@ -595,7 +595,7 @@ class Shooting(eqx.Module):
         times_left = (self._time_left(machine, i, last[i], ends[i]) for i in last)
         Y = jnp.concatenate(positions)
         low, high, nearest, pull = turns
-        i, j = jnp.argmin(nearest.margin), jnp.argmin(pull.margin)
+        i, j = jnp.argmin(nearest.share), jnp.argmin(pull.share)
         nearest, pull = (jax.tree.map(lambda x, k=k: x[k], a) for a, k in ((nearest, i), (pull, j)))
         margins = self.order_margins(machine, clock, ends - clock, states, sizes)
         order_of_events = reduce(
@@ -611,8 +611,8 @@ class Shooting(eqx.Module):
             units=approach[:, 1].ravel(),
             y_min=jnp.minimum(jnp.min(Y), jnp.min(low)),
             y_max=jnp.maximum(jnp.max(Y), jnp.max(high)),
-            nearest=nearest._replace(unit=sizes[i, nearest.event.astype(int)]),
-            pull=pull._replace(unit=sizes[j, pull.event.astype(int)] / self.sizes[0] ** 2),
+            nearest=nearest,
+            pull=pull._replace(unit=pull.unit / self.sizes[0] ** 2),
             modes_agree=jnp.min(agree),
             order_margin=reduce(jnp.minimum, times_left, order_of_events),
             duration=time if timed else jnp.asarray(cycle_time(machine), x.dtype) * self.cycles,
@@ -677,8 +677,8 @@ class Shooting(eqx.Module):
 
     def rest_margin(self, x: Vector, landing: int | None, chatters: Chatter) -> Scalar:
         """Return χ of the chatter that begins with the event `landing`. If that is `None`, return
-        the least force on a body within its rest. Both are zero where a rest is lost. `chatters`
-        holds the last impact of the chatter of each leg."""
+        the least force on a body within its rest, as a share of a size. Both are zero where a rest
+        is lost. `chatters` holds the last impact of the chatter of each leg."""
         machine, (clock, states), period = self.at(x), self.parts(x), self.period(x)
         ends, least = self.ends(clock, period), jnp.asarray(jnp.inf, x.dtype)
         last = lambda i: jax.tree.map(lambda a: a[i], chatters)
@@ -689,8 +689,9 @@ class Shooting(eqx.Module):
                 begin = last(i)
                 path = self.fly_leg(machine, i, begin, ends[i], rows=self.steps)[2]
                 h, flight = (ends[i] - begin.s) / self.steps, self.flight(machine, i)
-                pull = pull_of(Path(flight, path[0], path[1], h, not self.events))
-                least = jnp.minimum(least, pull.margin)
+                sizes = self.guard_sizes(flight, begin.s, begin.u)
+                pull = pull_of(Path(flight, path[0], path[1], h, not self.events), sizes)
+                least = jnp.minimum(least, pull.share)
         return least
 
     def saltation(

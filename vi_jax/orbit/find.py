@@ -88,9 +88,8 @@ def root_of(
         )
         sections = in_rows(run.sections)[: -1 : arc.cycles]
         arcs = jnp.where(jnp.isfinite(sections), sections, x)
-    found = find_root(
-        root_finder, lambda z: _residual(arc, z * sizes, unravel, end or arc) / sizes, arcs / sizes
-    )
+    residual = lambda z: _residual(arc, z * sizes, unravel, end or arc) / sizes
+    found = find_root(root_finder, residual, arcs / sizes, arc.cycles)
     found = found._replace(x=found.x * sizes)
     return jtu.tree_map(lambda a: a.astype(x.dtype), found)  # all floats, for `jvp`
 

@@ -58,14 +58,18 @@ def section_of(machine: AbstractMachine, cycle: int) -> Event:
     return Event(section_number(machine), cycle)
 
 
-def guard_at(before: "Flight", event: Event, s: Scalar, state: State) -> Scalar:
+def guard_at(
+    before: "Flight", event: Event, s: Scalar, state: State, new: Scalars | None = None
+) -> Scalar:
     """Return the guard of an event that ends the flight `before`; it is zero and rising there. `s`
-    counts from the begin of the period. The guard of a release is the force off the stop."""
+    counts from the begin of the period. The guard of a release is the force off the stop. `new` are
+    the modes after the event, if known."""
     if event.use == LEAVES:
         return -force_on(before, event.number, s, state)
     if event.cycle is not None:
         s = s - jnp.asarray(before.machine.cycle, s.dtype) * (event.cycle - 1)
-    return guard_of(before.machine, event.number, s, state, before.modes, before.contact)
+    given = before.machine, event.number, s, state, before.modes, before.contact
+    return guard_of(*given, new=new)
 
 
 def force_on(flight: "Flight", number: int, s: Scalar, state: State) -> Scalar:

@@ -126,6 +126,15 @@ def cycles_to_fly(problem: Shooting, x: Unknowns) -> int:
     return longest_leg(places, problem.events, period, problem.cycles)
 
 
+def method_of_runs(problem: Shooting, x: Unknowns) -> AbstractMethod:
+    """Return the method with as many steps in a cycle as the flights of a solution have."""
+    method, share = problem.method, problem.lengths(x).max() / float(problem.period(x))
+    steps = ceil(problem.steps / (float(share) * problem.cycles))
+    if not isinstance(method, FixedStep) or steps <= method.steps_per_cycle:
+        return method
+    return dataclasses.replace(method, steps_per_cycle=steps)
+
+
 @compiled
 def _fewest_steps(method: AbstractMethod, machine: AbstractMachine, like: State) -> Scalar | float:
     return machine.cycle / method.longest(machine, jnp.zeros(()), like)

@@ -19,7 +19,7 @@ from .edit_events import with_least_period, with_sections, without_events
 from .equations import Shooting
 from .kinds import with_article
 from .special import Point
-from .tolerances import LOCATED
+from .tolerances import BRIEF, LOCATED
 from .touch import NoLocalMapError, Touch, find_touches, touch_at
 
 
@@ -160,13 +160,26 @@ def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
             "Argument `point` must be a grazing of a stop, but there the section of the machine "
             "is touched: beyond it the motion has another number of cycles."
         )
-    removed = [i]
+    removed = {i, *point.lost}
     if old.events[i].of(old.machine).holds_mode:
-        neighbours = [j % old.legs for j in (i - 1, i + 1)]
-        removed += [j for j in neighbours if old.events[j].number == old.events[i].number][:1]
-    removed += [j for j in point.lost if j not in removed]
+        removed |= _changes_at_once(old, x, i)
     clock = since_section(old, x, float(old.values(x)[0][i]))
     return *with_sections(*without_events(old, x, sorted(removed))), old.events[i].number, clock
+
+
+def _changes_at_once(problem: Shooting, x: np.ndarray, i: int) -> set[int]:
+    """Return the events that coincide with event `i`, of the same switch: all of a brief contact,
+    of which the release may come before the end."""
+    is_brief = problem.lengths(x) < BRIEF * problem.radian
+    found = {i}
+    for step, leg in ((1, 0), (-1, -1)):
+        j = i
+        while is_brief[(j + leg) % problem.legs]:
+            j = (j + step) % problem.legs
+            if j in found or problem.events[j].number != problem.events[i].number:
+                break
+            found.add(j)
+    return found
 
 
 @on_host

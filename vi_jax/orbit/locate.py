@@ -45,6 +45,11 @@ class _TooCloseError(ArithmeticError):
     """The corrector has failed so often that no closer place can be reached."""
 
 
+def passes_zero(before: float, after: float) -> bool:
+    """Return whether a test changes its sign, or becomes exactly zero, from a point to the next."""
+    return before * after < 0 or (after == 0 and abs(before) > 0)
+
+
 def locate_zero(
     problem: Shooting, here: Step, new: Step, test: Callable[[Step], float],
     known: dict[float, Step] | None = None,

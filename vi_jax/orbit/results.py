@@ -217,8 +217,9 @@ class Orbit(Summarized):
     y_max: Float[Array, "..."]
     """Largest position of the first coordinate in the period."""
     clearance: Float[Array, "..."]
-    """Smallest distance to a stop at a turn that does not touch it; infinite without such a turn,
-    negative if the motion would pass through the stop."""
+    """Smallest distance to a stop at a turn that does not touch it, along a branch of several stops
+    the smallest as a share of the motion's size there; infinite without such a turn, negative if
+    the motion would pass through the stop."""
     monodromy: Float[Array, "... states states"]
     """Derivative of the map over the period, in the order of the state's leaves, on the section of
     the search, which `find_orbit` chooses away from the impacts."""

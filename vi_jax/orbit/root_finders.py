@@ -85,8 +85,8 @@ class Newton(AbstractRootFinder):
     **Arguments:**
 
     - `tolerance`: largest residual component of a found orbit, relative to the sizes of the
-      components of its state; by default 1e-10 in double and 1e-4 in single precision. The search
-      continues below it as long as the residual decreases.
+      components of its state; by default 1e-10 in double and 1e-4 in single precision, for each
+      cycle of the period. The search continues below it as long as the residual decreases.
     - `max_steps`: maximum number of steps; static.
     - `arcs`: 1 for single shooting. With more, the period is divided into that many arcs, whose
       first states are all unknowns (multiple shooting): for motions that amplify perturbations too
@@ -243,14 +243,18 @@ class Found(NamedTuple):
     """The unit of the tolerance: the largest unknown, or 1 at rest."""
 
 
-def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) -> Found:
+def find_root(
+    root_finder: AbstractRootFinder, residual: Residual, x: Unknowns, cycles: int = 1
+) -> Found:
     """Run a root finder from `x` until the residual is within its tolerance and decreases no more.
+    The usual tolerance is for each of the `cycles` over which a residual sums the steps' errors.
 
     A place with a residual that is not finite is never better than another.
     """
     tolerance = root_finder.tolerance
     if tolerance is None:
-        tolerance = root_finder.usual_tolerance if x.dtype == jnp.float64 else 1e-4
+        usual = root_finder.usual_tolerance if x.dtype == jnp.float64 else 1e-4
+        tolerance = usual * cycles
     nan, guess = jnp.full((), jnp.nan, x.dtype), x
 
     def unit(place):

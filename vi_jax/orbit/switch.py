@@ -20,7 +20,7 @@ from .edit_events import admissible_near, over_periods, repeated, without_events
 from .equations import Shooting
 from .find import find_orbit
 from .flight import Event
-from .from_orbit import events_in
+from .from_orbit import events_in, method_of_runs
 from .kinds import (
     CROSSING,
     DOUBLING,
@@ -39,7 +39,7 @@ from .kinds import (
     starts,
 )
 from .local_map import graze_at
-from .locate import locate_zero
+from .locate import locate_zero, passes_zero
 from .results import Orbit
 from .sliding import change_at, without_part
 from .special import Point, point_at
@@ -162,7 +162,7 @@ def _search(
             guesses.append(jax.tree.map(lambda x: x[0], sections_at(problem, near_step.x)[0]))
     sense = np.copysign(1.0, float(step.tangent[-1]))
     n = problem.cycles
-    options: Any = {"method": problem.method}
+    options: Any = {"method": method_of_runs(problem, step.x)}
     for side in (sense, -sense):
         value = point.parameter + side * distance * float(point.scale[-1])
         machine = with_leaf(problem.machine, problem.parameters[-1], value)
@@ -317,7 +317,7 @@ def _locate_change(two: Shooting, x: np.ndarray, distance: float, test: str) -> 
     for i, side in itertools.product(range(_STEPS), (0, 1)):
         here = ends[side]
         step = advance(two, here.x, here.tangent, _FIRST * distance * 2**i)
-        if bool(step.good) and value(here) * value(step) < 0:
+        if bool(step.good) and passes_zero(value(here), value(step)):
             return locate_zero(two, here, step, value)
         ends[side] = step if bool(step.good) else here
     return None

@@ -39,7 +39,8 @@ class Path(NamedTuple):
 
 
 class Nearest(NamedTuple):
-    """The turning point that is nearest to an event which does not happen there."""
+    """The turning point that is nearest to an event which does not happen there, as a share of the
+    distance's size."""
 
     margin: Scalar
     """Distance to the stop at a body's turn; for another event, its guard's distance below zero.
@@ -49,7 +50,11 @@ class Nearest(NamedTuple):
     event: Scalar
     """The number of the event."""
     unit: Any = 1.0
-    """The size of that distance along the motion (see `Shooting.observe`)."""
+    """The size of that distance along the motion (see `Shooting.guard_sizes`)."""
+
+    @property
+    def share(self) -> Any:
+        return self.margin / self.unit
 
 
 class _Turns(NamedTuple):
@@ -129,21 +134,22 @@ _Margins = tuple[Float[Array, " steps"], Float[Array, " steps"]]
 """`Nearest.margin` of one event in each step, infinite without a turn; the clock of the turn."""
 
 
-def turns_of(path: Path) -> tuple[Scalar, Scalar, Nearest, Nearest]:
+def turns_of(path: Path, sizes: Vector) -> tuple[Scalar, Scalar, Nearest, Nearest]:
     """Return least and greatest turn of the first coordinate, the turn nearest to an event, and the
-    result of `pull_of`. Without a turn the first two are infinite."""
+    result of `pull_of`. Without a turn the first two are infinite. `sizes` are those of guards."""
     bodies, margins = turning_points(path)
     low = jnp.min(jnp.where(bodies[0].turns, bodies[0].height, jnp.inf))
     high = jnp.max(jnp.where(bodies[0].turns, bodies[0].height, -jnp.inf))
-    return low, high, _least_margin(dict(enumerate(margins)), path.h), pull_of(path)
+    return low, high, _least_margin(dict(enumerate(margins)), path.h, sizes), pull_of(path, sizes)
 
 
-def _least_margin(margins: dict[int, _Margins], h: Scalar) -> Nearest:
-    least = Nearest(jnp.full((), jnp.inf, h.dtype), *2 * (jnp.zeros((), h.dtype),))
+def _least_margin(margins: dict[int, _Margins], h: Scalar, sizes: Vector) -> Nearest:
+    zero = jnp.zeros((), h.dtype)
+    least = Nearest(jnp.full_like(zero, jnp.inf), zero, zero, jnp.ones_like(zero))
     for number, (margin, clock) in margins.items():
         i = jnp.argmin(margin)
-        nearest = Nearest(margin[i], clock[i], jnp.full((), float(number), h.dtype))
-        nearer = nearest.margin < least.margin
+        nearest = Nearest(margin[i], clock[i], jnp.full_like(zero, number), sizes[number])
+        nearer = nearest.share < least.share
         least = jax.tree.map(lambda a, b, nearer=nearer: jnp.where(nearer, a, b), nearest, least)
     return least
 
@@ -193,7 +199,7 @@ def _turns_in(path: Path, watched: _Quantity) -> _Turns:
     return jax.vmap(lambda *x: flight.once(partial(_turn, watched), (h, *x)))(places, states, v, v1)
 
 
-def pull_of(path: Path) -> Nearest:
+def pull_of(path: Path, sizes: Vector) -> Nearest:
     """Return the least extremum of the force on a resting body, with the force as `margin`."""
     flight, forces = path.flight, {}
     for number, stop in enumerate(stops_of(flight.machine) if flight.contact else ()):
@@ -201,7 +207,7 @@ def pull_of(path: Path) -> Nearest:
         rests = flight.contact[stop.coordinate] == 1.0 + number
         force = jnp.where(turn.turns & (turn.before > 0) & rests, -turn.height, jnp.inf)
         forces[number] = (force, turn.place)
-    return _least_margin(forces, path.h)
+    return _least_margin(forces, path.h, sizes)
 
 
 def _state_after_step(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:

@@ -230,7 +230,10 @@ class _Walk:
         return end
 
     def _append(self, step: Step | None, point: Point | None = None) -> None:
-        self.steps += [] if step is None else [step]
+        if step is not None:
+            moves = np.abs(np.asarray(step.x) - self.steps[-1].x) / self.table.scale
+            kept = len(self.steps) - int(moves.max() <= EXACT)  # a special point may be a step
+            self.steps[kept:] = [step]
         if point is not None:
             self.special.append(dataclasses.replace(point, index=len(self.steps) - 1))
 

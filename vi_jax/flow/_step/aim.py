@@ -557,6 +557,8 @@ def _find_events(plan: Plan, lane: Lane, trial: Trial) -> _Found:
                 below.append(~left & ((path.pull.end.x <= 0) | landed) & path.pull.is_used)
         end, twice = path.end, twice | may_turn_twice(plan, lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
+        if lane.contact is not None:  # at rest a velocity is the error of the landing
+            turned = turned & (lane.contact[k] == 0)
         if not stops_exact or any(x.blends for x in switches_of(plan.machine)):
             # A turn that is closer than the clock resolves, as of a body that a rounded difference
             # has almost stopped, has nothing before it to step to. Nor does it count if all that

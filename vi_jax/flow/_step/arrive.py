@@ -322,8 +322,10 @@ def _along_velocities(plan: Plan, lane: Lane, when: Flag) -> Scalars:
     direction = list(lane.direction)
     for k, body in enumerate(plan.machine.coordinates):
         v, (_, slow) = body.velocity(lane.state), plan.rounding_bounds(k, lane.state)
-        v = stop_gradient(v)
-        direction[k] = jnp.where(when & (jnp.abs(v) > slow), jnp.sign(v), direction[k])
+        v, moves = stop_gradient(v), when
+        if lane.contact is not None:
+            moves = when & (lane.contact[k] == 0)
+        direction[k] = jnp.where(moves & (jnp.abs(v) > slow), jnp.sign(v), direction[k])
     return tuple(direction)
 
 
@@ -423,7 +425,10 @@ def _directions_at_end(plan: Plan, lane: Lane, trial: Trial) -> Scalars:
     for k, along in enumerate(lane.direction):
         if trial.paths:
             v = stop_gradient(trial.paths[k].end.v)
-            turned = jnp.where(v == 0, along, jnp.sign(v))
+            stands = v == 0
+            if lane.contact is not None:  # at rest a velocity is the error of the landing
+                stands = stands | (lane.contact[k] > 0)
+            turned = jnp.where(stands, along, jnp.sign(v))
             # At a turning point the sign of the velocity is rounding.
             away = -along
             if plan.others(lane.state) or len(trial.paths) > 1:
