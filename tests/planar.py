@@ -50,6 +50,7 @@ class Rod(vi.Mechanical):
     """A rod of length 2 and mass 1, whose lower end is on a floor; θ is its angle to the floor."""
 
     mu: Any = 0.3
+    restitution: Any = 0.0
     weight: Any = 9.81
     cycle: Any = 0.02
     q = ("x", "y", "theta")
@@ -58,9 +59,9 @@ class Rod(vi.Mechanical):
     @property
     def contacts(self):
         tip = lambda q: q.x - jnp.cos(q.theta)
-        return vi.RigidStop(
-            0.0, 0.0, "left", on=lambda q: q.y - jnp.sin(q.theta), friction=self.mu, along=tip
-        )
+        height = lambda q: q.y - jnp.sin(q.theta)
+        rubs = dict(friction=self.mu, along=tip)
+        return vi.RigidStop(0.0, self.restitution, "left", on=height, **rubs)
 
     def force(self, t, q, v):
         return dict(x=0.0, y=-self.weight, theta=0.0)

@@ -85,6 +85,7 @@ class Table(vi.Mechanical):
 
     q = ("x", "y", "w")
     mass = (2.0, 2.0, 0.5)
+    push: float = 1.0
     cycle = 2 * np.sqrt(2 * 0.3 / G)
     contacts = (
         vi.RigidStop(0.0, 1.0, "left", on="y", friction=0.1, along="x", name="table"),
@@ -92,7 +93,7 @@ class Table(vi.Mechanical):
     )
 
     def force(self, t, q, v):
-        return dict(x=1.0, y=-2.0 * G, w=-0.5 * G)
+        return dict(x=self.push, y=-2.0 * G, w=-0.5 * G)
 
 
 def test_forces_as_a_measure():
@@ -103,6 +104,10 @@ def test_forces_as_a_measure():
     axes = {"start.y": [0.0, 0.3]}
     found = vi.scan(table, axes, start=start, settle=0, cycles=3, measure=measure)
     rests, bounces = (found.isel({"start.y": i}) for i in range(2))
+    given = dict(start=start, settle=0, cycles=3, measure=measure)
+    swept = vi.sweep(table, "push", [1.0, 1.5], **given).measured
+    np.testing.assert_allclose(swept["table_normal"], [2 * G, 2 * G], rtol=1e-12)
+    np.testing.assert_allclose(swept["table_tangential_max"], [1.0, 1.5], rtol=1e-12)
     for data in (rests, bounces):
         assert float(data.spring_normal) == pytest.approx(0.5 * G, rel=1e-9)
     assert float(rests.table_normal) == pytest.approx(2 * G, rel=1e-12)

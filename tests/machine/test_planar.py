@@ -1,6 +1,8 @@
 """Planar bodies with corners on a floor: blocks that slide, tip, land and bounce, and Painlevé's
 rod. Numbers of blocks are closed forms, or follow from the linear complementarity problem."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -164,6 +166,22 @@ def test_a_rod_that_slides_into_the_ground_jams():
     assert bool((gain[~jams] < 1e-12).all())
 
 
+def test_a_rod_that_bounces_to_rest_sticks_at_once():
+    """Its last bounces are summed up, and in their time the tip gets a slip of second order."""
+
+    def one(mu, restitution):
+        rod = Rod(mu=mu, restitution=restitution, cycle=0.3)
+        start = rod.sliding(1.2, -1.0, -2.0)
+        run = vi.simulate(rod, start.replace(y=start.y + 0.01), 1, event_log=80, max_impacts=200)
+        return run.successful, run.event_log
+
+    good, log = jax.jit(jax.vmap(one))(*jnp.array([(0.8, 0.3), (0.8, 0.6), (1.6, 0.3)]).T)
+    kind, phase = np.asarray(log.kind)[:, 0], np.asarray(log.phase)[:, 0]
+    rest, mode = (kind == vi.EVENTS.index(x) for x in ("rest", "mode"))
+    assert bool(good.all()) and (rest.sum(1) == 1).all()
+    assert not (mode & (np.abs(phase - phase[rest][:, None]) < 1e-6)).any()
+
+
 @pytest.mark.slow
 def test_two_corners_hold_a_block_together(blocks):
     """The corners have linearly dependent tangents, so their forces are not unique. With friction
@@ -204,6 +222,65 @@ def test_tall_blocks_rock_to_rest():
     # rest are summed up, with an error of second order in the time that they take.
     assert bool((slid > -1e-8).all())
     np.testing.assert_allclose(slid[:4], 0.0, atol=1e-8)
+
+
+class Feet(Block):
+    """A body with feet at these places, on a floor that is shaken."""
+
+    feet: tuple = (-0.2, 0.2)
+    size: Any = 3.0
+    cycle = 0.5
+
+    @property
+    def contacts(self):
+        h, found = self.half_height, []
+        for place in self.feet:
+            height = lambda q, b=place: q.y + b * jnp.sin(q.tilt) - h * jnp.cos(q.tilt)
+            along = lambda q, b=place: q.x + b * jnp.cos(q.tilt) + h * jnp.sin(q.tilt)
+            rubs = dict(friction=self.mu, along=along)
+            found.append(vi.RigidStop(0.0, self.restitution, "left", on=height, **rubs))
+        return tuple(found)
+
+    def force(self, t, q, v):
+        return dict(x=self.size * jnp.sin(4 * jnp.pi * t), y=-9.81, tilt=0.0)
+
+
+@pytest.mark.slow
+def test_a_third_foot_between_two_changes_nothing():
+    """The load moves from one side of the middle foot to the other, and the body slides or tips:
+    two feet carry it at a time, and a third one takes over."""
+
+    def one(mu, size, places):
+        body = Feet(mu=mu, size=size, feet=places)
+        run = vi.simulate(body, body.at(y=0.5), 2)
+        last = run.last
+        return run.successful, jnp.stack([last.x, last.y, last.tilt, last.v.x, last.v.tilt])
+
+    cases = jnp.array([(0.2, 3.0), (0.9, 3.0), (0.45, 5.0), (0.9, 6.0)]).T
+    many = lambda places: jax.jit(jax.vmap(lambda *x: one(*x, places)))(*cases)
+    (two, expected), (three, found) = many((-0.2, 0.2)), many((-0.2, 0.05, 0.2))
+    assert bool(two.all()) and bool(three.all())
+    np.testing.assert_allclose(found[:2], expected[:2], atol=1e-12)
+    # After landings on two feet in turn, which are summed up.
+    np.testing.assert_allclose(found[2:], expected[2:], atol=2e-6)
+
+
+@pytest.mark.slow
+def test_a_third_foot_comes_to_rest_with_two_others():
+    """The body is dropped on one foot and bounces to rest on all."""
+
+    def one(mu, size, tilt, places):
+        body = Feet(mu=mu, size=size, feet=places, restitution=0.3)
+        lift = jnp.maximum(-tilt * places[-1], -tilt * places[0]) + 0.5
+        run = vi.simulate(body, body.at(y=lift, tilt=tilt), 2, max_impacts=2000)
+        last = run.last
+        return run.successful, jnp.stack([last.x, last.y, last.tilt, last.v.x, last.v.tilt])
+
+    cases = jnp.array([(0.27, 3.0, 0.01), (0.5, 2.0, -0.02), (0.5, 2.0, 0.04)]).T
+    many = lambda places: jax.jit(jax.vmap(lambda *x: one(*x, places)))(*cases)
+    (two, expected), (three, found) = many((-0.33, 0.54)), many((-0.33, 0.0002, 0.54))
+    assert bool(two.all()) and bool(three.all())
+    np.testing.assert_allclose(found, expected, atol=1e-10)
 
 
 class Shaken(Block):

@@ -337,3 +337,22 @@ def test_a_rod_strikes_the_ground_with_much_friction():
             or drag == pytest.approx(-level * np.sign(after[2]))
         )
         assert blow.impulse @ (after + x.velocity) <= 1e-12
+
+
+def test_a_foot_that_others_hold_is_spare():
+    """Feet of a body in a row, in any order, with the load between two of them: only these push. A
+    load beyond the last one opens the others."""
+
+    def question(places, load):
+        rows = [[0, 1, x] for x in places] + [[1, 0, 1]] * len(places)
+        return padded(rows, np.eye(3), [0.5, -g, -g * load + 0.5], [0.9] * len(places))
+
+    orders = list(itertools.permutations((-0.4, 0.1, 0.4)))
+    loads = (-0.2, 0.2, 0.3)
+    found = answers([question(x, load) for x in orders for load in loads])
+    for answer in found:
+        assert answer.kept[:3].all() and answer.spare[:3].sum() == 1
+        assert (answer.spare[:3] == (answer.force[:3] == 0)).all()
+    over = answers([question(x, 0.6) for x in orders])
+    for places, answer in zip(orders, over, strict=True):
+        assert (answer.kept[:3] == (np.array(places) == 0.4)).all() and not answer.spare.any()

@@ -8,6 +8,7 @@ import jax.tree_util as jtu
 from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
     begin_modes,
+    chosen_stop,
     frictions_in,
     has_contact_friction,
     holds_anywhere,
@@ -16,6 +17,7 @@ from ..machine import (
     on_held_surfaces,
     pressed_contacts,
     stops_of,
+    stops_on,
     struck_modes,
     switches_of,
 )
@@ -60,7 +62,7 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
         if has_contact_friction(machine) or (stops_of(machine) and holds_anywhere(machine)):
             modes = struck_modes(machine, s, start, modes, contact=contact)
         if is_compound(machine):
-            contact = pressed_contacts(machine, s, start, modes, contact)
+            contact = pressed_contacts(machine, s, start, modes, contact)[1]
     slides = any(x.blends for x in switches_of(machine))
     if slides or holds_anywhere(machine) or has_contact_friction(machine):
         start = on_held_surfaces(machine, s, start, modes, contact or ())
@@ -93,31 +95,23 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
 
 
 def _contacts_at(plan: Plan, start: State, current: list[Rates], jerks: list[Scalar]) -> Scalars:
-    """Return the stops on which the coordinates rest, by their rates and those of the forces."""
-    found = []
-    for k, (body, rate) in enumerate(zip(current, jerks, strict=True)):
-        slack, slow = plan.rounding_bounds(k, start)
-        if not stops_are_exact(plan.machine, start):
+    """Return the stops on which the coordinates rest, by their rates and those of the forces: they
+    are pressed on, or about to be by a force that grows. Of several contacts, `pressed_contacts`
+    decides later. Positions and velocities are known to the rounding of a search that ends there.
+    """
+    machine, found = plan.machine, []
+    for k, (here, jerk) in enumerate(zip(current, jerks, strict=True)):
+        eps = float(jnp.finfo(here.x.dtype).eps)
+        (slack, slow), least = plan.rounding_bounds(k, start), 4 * eps * plan.extent(k)
+        if not stops_are_exact(machine, start):
             # A resting body gathers the rounding of the force on it: a woodpecker 0.03 of this.
-            share = 4 * float(jnp.finfo(body.x.dtype).eps)
-            slow = jnp.maximum(slow, share * plan.machine.cycle * jnp.abs(body.a))
-        found.append(_rests_on(plan, k, body, rate, slack, slow))
+            slow = jnp.maximum(slow, 4 * eps * machine.cycle * jnp.abs(here.a))
+        slack, slow = jnp.maximum(slack, least), jnp.maximum(slow, least / plan.unit)
+        rests = {}
+        for i in stops_on(machine, k):
+            stop = stops_of(machine)[i]
+            pushes = here.a != 0 if is_compound(machine) else stop.sign * here.a > 0
+            pressed = pushes | (here.a == 0) & (stop.sign * jerk > 0)
+            rests[i] = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slow) & pressed
+        found.append(chosen_stop(machine, k, rests, jnp.zeros_like(here.x)))
     return tuple(found)
-
-
-def _rests_on(
-    plan: Plan, k: int, current: Rates, jerk: Scalar, slack: Scalar | float, slow: Scalar | float
-) -> Scalar:
-    """Return the stop on which coordinate number k rests at the start, or 0: it is pressed on, or
-    about to be by a force that grows. Of several contacts, `pressed_contacts` decides later which
-    are pressed on. Its position is known to within `slack`, its velocity to
-    `slow`, and both to the rounding of a search that ends there."""
-    contact, least = jnp.zeros_like(current.x), 4 * jnp.finfo(current.x.dtype).eps * plan.extent(k)
-    slack, slow = jnp.maximum(slack, least), jnp.maximum(slow, least / plan.unit)
-    for i, stop in enumerate(stops_of(plan.machine)):
-        if stop.coordinate == k:
-            pushes = current.a != 0 if is_compound(plan.machine) else stop.sign * current.a > 0
-            pressed = pushes | (current.a == 0) & (stop.sign * jerk > 0)
-            rests = (stop.beyond(current.x) >= -slack) & (jnp.abs(current.v) <= slow) & pressed
-            contact = jnp.where(rests, to_event(i), contact)
-    return contact

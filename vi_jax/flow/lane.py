@@ -84,7 +84,8 @@ class Lane(NamedTuple):
     direction: Scalars
     """For each coordinate, the sign of its velocity since the last turning point or impact."""
     contact: Scalars | None
-    """For each coordinate, 1 + i while it rests on stop number i, else 0; `None` without rests."""
+    """For each coordinate, 1 + i while it rests on stop number i, else 0; `None` without rests. A
+    contact that others hold, such as that of a table's fourth leg, is spare: negative."""
     modes: Scalars
     """The mode of each switch, then the machine's own modes."""
     below: Scalars

@@ -429,19 +429,22 @@ def settled_modes(
         begins = tuple(released.get(i, none) for i in frictions_in(machine))
     slip_of, solve = (cast(Any, x) for x in (_slips, _settled))
     given = slip_of(machine, s, state, modes, begins)
-    return solve(machine, s, state, modes, contact, *given)[0]
+    return solve(machine, s, state, modes, contact, *given, contact)[0]
 
 
 def pressed_contacts(
-    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
-) -> Scalars:
-    """Return the contacts (as in `EventContext`) without those that the forces of this state open,
-    in these modes of frictions."""
+    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
+    opened: Scalars | None = None,
+) -> tuple[Scalars, Scalars]:  # fmt: skip
+    """Return the modes, and the contacts (as in `EventContext`) without those that the forces of
+    this state open. Of those that are `opened`, the spare ones stay closed. Frictions that slip in
+    `modes` go on."""
     indices, switches, solve = frictions_in(machine), switches_of(machine), cast(Any, _settled)
     slips = tuple(jnp.where(jnp.abs(modes[i]) < 1, 0.0, modes[i]) for i in indices)
     ratios = (switches[i].static_share(machine, s, state) for i in indices)
     holds = tuple(ratio + jnp.zeros_like(s) for ratio in ratios)
-    return solve(machine, s, state, modes, contact, slips, holds)[1]
+    opened = contact if opened is None else opened
+    return solve(machine, s, state, modes, contact, slips, holds, opened)
 
 
 @eqx.filter_jit
@@ -467,10 +470,11 @@ def _slips(
 @eqx.filter_jit
 def _settled(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
-    slips: Scalars, holds: Scalars,
+    slips: Scalars, holds: Scalars, opened: Scalars,
 ) -> tuple[Scalars, Scalars]:  # fmt: skip
     """Return the modes with those of all frictions, by their slips, and the contacts that stay
-    closed; jitted like `_solve_forces`."""
+    closed, spare ones with a minus (see `Lane.contact`); jitted like `_solve_forces`."""
+    contact = tuple(jnp.abs(x) for x in contact) if len(limited_in(machine)) > 1 else contact
     new, kept, switches = list(modes), list(contact), switches_of(machine)
     for i, slip in zip(frictions_in(machine), slips, strict=True):
         new[i] = slip
@@ -481,7 +485,11 @@ def _settled(
         mode = jnp.where(answer.unsolved, jnp.nan, answer.mode[n])
         new[i] = jnp.where(touches[n], mode, new[i])
     for row, k in enumerate(limited_in(machine) if contact else ()):
-        kept[k] = jnp.where(answer.kept[row] | answer.unsolved, contact[k], 0.0)
+        stays = answer.kept[row] | answer.unsolved
+        kept[k] = jnp.where(stays, contact[k], 0.0)
+        if len(kept) > 1:
+            spare = answer.spare[row] & ~answer.unsolved
+            kept[k] = jnp.where(spare, -jnp.abs(opened[k]), kept[k])
     return tuple(new), tuple(kept)
 
 

@@ -85,6 +85,8 @@ class Settled(NamedTuple):
     """a, (m,)."""
     kept: Array
     """True for contacts that stay closed, (n,)."""
+    spare: Array
+    """True for contacts that others hold, such as the fourth leg of a table, (n,)."""
     mode: Array
     """For each friction its slip ±1, 0 for sticking, or ±¼ and ±¾ (see `Friction`), (t + d,)."""
     unsolved: Array
@@ -274,16 +276,15 @@ def forces_in(
 _REDUNDANT = 1e-9
 
 
-def _redundant(gains: Array, pushes: Array, holds: Array, still: Array) -> Array:
-    """Return which rows depend linearly on those that push or hold, or on one before that is
-    `still`."""
+def _redundant(gains: Array, first: Array, still: Array) -> Array:
+    """Return which rows depend linearly on the `first` ones, or are `still` and depend on these
+    and on one before that is still, too."""
     gains, rows = stop_gradient(gains), np.arange(gains.shape[0])
     own = jnp.sum(gains * np.eye(len(rows)), 1)
     zeros, least = jnp.zeros((len(rows),), gains.dtype), _share(_REDUNDANT, gains) * own
-    first = jnp.concatenate([pushes, holds])
-    takes = jnp.stack([first, jnp.concatenate([pushes & False, still])])
+    takes = jnp.stack([first, still])
 
-    def step(state: tuple, given: tuple) -> tuple[tuple, None]:
+    def step(state: tuple, given: tuple) -> tuple[tuple, Array]:
         table, found = state
         row, takes = given
         here = rows == row
@@ -293,11 +294,12 @@ def _redundant(gains: Array, pushes: Array, holds: Array, still: Array) -> Array
         any_counts = jnp.any(counts)
         change = column[:, None] * jnp.sum(jnp.where(here[:, None], table, 0.0), 0)
         change = change / jnp.where(any_counts, pivot, 1.0)
-        return (jnp.where(any_counts, table - change, table), jnp.where(counts, 1.0, found)), None
+        table = jnp.where(any_counts, table - change, table)
+        return (table, jnp.where(counts, 1.0, found)), jnp.sum(table * np.eye(len(rows)), 1)
 
     order = np.tile(rows, 2) * 1.0, jnp.repeat(takes, len(rows), 0)
-    (table, found), _ = jax.lax.scan(step, (gains, zeros), order)
-    return (found == 0) & (jnp.sum(table * np.eye(len(rows)), 1) <= least)
+    carry, left = jax.lax.scan(step, (gains, zeros), order)
+    return (carry[1] == 0) & (jnp.where(still, left[-1], left[len(rows) - 1]) <= least)
 
 
 def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) -> Settled:
@@ -318,12 +320,23 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
     still = ~found.holds & (x.slip == 0) & (moves[n:] == 0)
     # A slip without a force goes where it is accelerated.
     mode = jnp.where(~found.holds & (found.mode == 0), moves[n:], found.mode)
-    if x.slip.shape[0] > 1:  # others hold a redundant one, which keeps its largest force, or none
-        known = still & (mode == 0)
-        spare = still & _redundant(x.gains, found.pushes, found.holds, known)[n:]
-        mode = jnp.where(spare, jnp.where(mode == 0, 0.25, 0.75 * mode), mode)
-    kept = x.closed & (found.pushes | (moves[:n] <= 0))
-    return Settled(found.force, rate, kept, mode, found.code != SOLVED)
+    kept, spare = x.closed & (found.pushes | (moves[:n] <= 0)), x.closed & False
+    if n > 1 or x.slip.shape[0] > 1:
+        pushes, acts, t = found.pushes, found.holds, len(of)
+        if n:  # a contact that is about to open is not pushed, but for rounding
+            own = jnp.sum(x.gains * np.eye(rate.shape[0]), 1)[:n]
+            pushes = pushes & (own * found.force[:n] > _share(_OPENS, rate) * size)
+        if of:  # a contact that is not pushed has no friction
+            on = _normals(x, of)[:t] @ jnp.where(pushes, 1.0, jnp.zeros_like(rate[:n]))
+            acts = acts.at[:t].set(acts[:t] & (on > 0))
+        first = jnp.concatenate([pushes, acts])
+        known = jnp.concatenate([kept & ~pushes, still & (mode == 0)])
+        redundant = _redundant(x.gains, first, known) & ~first
+        spare = redundant[:n]
+        # Others hold a redundant friction, which keeps its largest force, or none.
+        held = still & redundant[n:]
+        mode = jnp.where(held, jnp.where(mode == 0, 0.25, 0.75 * mode), mode)
+    return Settled(found.force, rate, kept, spare, mode, found.code != SOLVED)
 
 
 def _decide_with_ratios(x: Contacts, of: tuple[int, ...]) -> _Decided:
@@ -357,7 +370,8 @@ def _settle_one(x: Contacts) -> Settled:
     slip = jnp.where(jnp.abs(needed) <= x.hold * x.level, 0.0, -jnp.sign(needed))
     mode = jnp.where(x.slip != 0, x.slip, slip)
     force = jnp.where(mode == 0, needed, -mode * x.level)
-    return Settled(force, x.rates + x.gains[0] * force, x.closed, mode, jnp.zeros((), bool))
+    none = jnp.zeros((), bool)
+    return Settled(force, x.rates + x.gains[0] * force, x.closed, x.closed, mode, none)
 
 
 class Blow(NamedTuple):

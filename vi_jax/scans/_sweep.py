@@ -56,7 +56,7 @@ from ..machine import (
     without_modes,
 )
 from .measures import CODES, REGIMES, AbstractMeasure, Regime, Usual, flags, legends
-from .program import cycles_for, lane_noise_of, measures_of
+from .program import cycles_for, lane_noise_of, measures_of, samples_for
 
 # A change is large from this many times the changes at neighbouring values, and this share of the
 # largest position, or of ζ, on: choices. It may be a jump, or a steep change in a coarse sweep.
@@ -229,8 +229,8 @@ def sweep(
     - `start`: state at the first value; by default the machine's `start()`.
     - `settle`, `cycles`: drive cycles at each value before observation, and observed (by default
       32 or as many as the measures need); static.
-    - `measure`: measures as for `scan`, such as `vi.Rotation()`, that return one number a motion
-      from its cycles.
+    - `measure`: measures as for `scan`, such as `vi.Rotation()` or `vi.ContactForces()`, that
+      return one number a motion from its cycles.
     - `method`, `clock`: as for `simulate`; by default the `"standard"` preset.
     - `tolerance`: the largest difference of sections that repeat, as in `Regime`.
     - `max_steps`: the largest number of steps at each value; with more, it counts as failed.
@@ -280,7 +280,7 @@ def sweep(
 def _measures_of_cycles(measure: Any) -> tuple[AbstractMeasure, ...]:
     measures = measures_of(measure)
     for each in measures:
-        if each.instants or type(each).refine is not AbstractMeasure.refine:
+        if type(each).refine is not AbstractMeasure.refine:
             raise ValueError(
                 "Argument `measure` must be of measures of the observed cycles alone, but a "
                 f"{type(each).__name__} needs more of each motion: use `scan`."
@@ -374,6 +374,7 @@ def _sweep(
         state = moved_by_stops(current, state)
         run = simulate(
             current, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps,
+            samples=samples_for(measures), impact_log=max((m.listed for m in measures), default=0),
             **noise,
         )  # fmt: skip
         state = jtu.tree_map(lambda a, b: jnp.where(run.successful, a, b), run.last, state)

@@ -11,6 +11,7 @@ from ...machine import (
     AbstractEvent,
     AbstractMachine,
     after_event,
+    chosen_stop,
     constant_modes,
     event_of,
     events_of,
@@ -26,6 +27,7 @@ from ...machine import (
     section_number,
     settled_modes,
     stops_of,
+    stops_on,
     struck_modes,
     switches_of,
 )
@@ -48,6 +50,11 @@ from .trial import AppliedStep, Release, Trial
 # Each event of one instant may happen this often, by choice, before the lane ends: some trigger
 # each other for ever.
 _ROUNDS = 4
+
+
+# Which contacts take over from one that opens is seen this much later (for a cycle of about 2π): a
+# choice, so that forces differ from those at the event by more than the share that opens a contact.
+_SOON = 1e-6
 
 
 class _DueEvents(NamedTuple):
@@ -253,27 +260,43 @@ def release_pulled(
     old, modes_before = before
     contacts, direction = list(contact), list(lane.direction)
     together = is_compound(machine)
-    kept = pressed_contacts(machine, s, lane.state, modes, contact) if together else contact
+    kept = contact
+    if together:
+        closed = contact if contact_before is None else _with_touching(plan, lane, contact)
+        kept = pressed_contacts(machine, s, lane.state, modes, contact, opened=closed)[1]
     for k in limited_in(machine):
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
             free = hold_contacts(machine, modes, contact, but=k)
             return rates(free.field, machine.coordinates[k], s, state).a
 
-        sign, _ = plan.sign_and_gap(k, contact[k])
+        sign, _ = plan.sign_and_gap(k, jnp.abs(contact[k]))
         if together:
             leaves = kept[k] == 0
+            contacts[k] = jnp.where(when & ~leaves, kept[k], contact[k])
         else:
             pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, lane.state)
             leaves = stop_gradient((pressed >= 0) & (pulled < 0))
-        leaves = when & (contact[k] > 0) & leaves
+        leaves = when & (contact[k] != 0) & leaves
         if contact_before is not None:
-            leaves = leaves & (contact_before[k] == contact[k])
-        clock, stop = plan.clock(lane.s, lane.state), contact[k] - to_event(0)
+            leaves = leaves & (jnp.abs(contact_before[k]) == jnp.abs(contact[k]))
+        clock, stop = plan.clock(lane.s, lane.state), jnp.abs(contact[k]) - to_event(0)
         lane = lane.log_event(taken & leaves, clock, EventKind.release, stop, jnp.nan)
-        contacts[k] = jnp.where(leaves, 0.0, contact[k])
+        contacts[k] = jnp.where(leaves, 0.0, contacts[k])
         direction[k] = jnp.where(leaves, -sign, direction[k])
     return lane._replace(contact=tuple(contacts), direction=tuple(direction))
+
+
+def _with_touching(plan: Plan, lane: Lane, contact: Scalars) -> Scalars:
+    """Return the contacts with those of bodies that touch a stop and move with it, to rounding."""
+    found, stops = list(contact), stops_of(plan.machine)
+    for k in limited_in(plan.machine):
+        body, (slack, slow) = plan.machine.coordinates[k], plan.rounding_bounds(k, lane.state)
+        place, still = body.position(lane.state), jnp.abs(body.velocity(lane.state)) <= slow
+        near = {i: still & (stops[i].beyond(place) >= -slack) for i in stops_on(plan.machine, k)}
+        touching = chosen_stop(plan.machine, k, near, jnp.zeros_like(lane.s))
+        found[k] = jnp.where(contact[k] == 0, stop_gradient(touching), contact[k])
+    return tuple(found)
 
 
 def _update_after(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> Lane:
@@ -435,9 +458,9 @@ def _land(step: AppliedStep, lane: Lane, places: Scalars) -> tuple[Lane, Scalars
         lane = lane.update_record(integrals=integrals)
         before = tuple(jnp.where(met, plan.machine.position(at_event), Y) for Y in before)
         lane = _apply_event(step, lane, at_event)
-    for k, path in enumerate(trial.paths):
-        if path.near is not None:
-            lane = _release_body(step, lane, k, path.near.release)
+    releases = {k: x.near.release for k, x in enumerate(trial.paths) if x.near is not None}
+    if releases:
+        lane = _release_bodies(step, lane, releases)
     places = (plan.machine.position(lane.state), *before)
     # At a switch the field may have an infinite slope (Hertz's damper at first touch). Derivatives
     # are finite along with the event, but not at a fixed clock.
@@ -512,7 +535,36 @@ def _at_fixed_clock(step: AppliedStep, lane: Lane) -> Lane:
     return lane._replace(s=s, state=state, slip=slip).update_record(integrals=integrals)
 
 
-def _release_body(step: AppliedStep, lane: Lane, k: int, release: Release) -> Lane:
+def _release_bodies(step: AppliedStep, lane: Lane, releases: dict[int, Release]) -> Lane:
+    """Return the lane after the bodies' releases on which the step landed."""
+    plan, before = step.plan, lane.contact
+    for k, release in releases.items():
+        lane = _at_release(step, lane, k, release)
+    contact = lane.contact
+    assert contact is not None and before is not None
+    if len(releases) > 1:  # a spare contact may take over
+        moving = lane.s, lane.state, lane.record.integrals
+        later = plan.in_units(_SOON + jnp.zeros_like(lane.s))
+        s, soon, _ = step.flow.extrapolate(stop_gradient(later), moving)
+        modes, kept = pressed_contacts(plan.machine, s, soon, lane.modes, contact, opened=before)
+        # Contacts that open next have releases of their own.
+        pairs = zip(kept, contact, strict=True)
+        kept = tuple(jnp.where(x == 0, jnp.abs(old), x) for x, old in pairs)
+        new, old = (constant_modes(modes, lane.s), kept), (lane.modes, contact)
+        met = any_of(step.taken, (x.landed for x in releases.values()))
+        modes, contact = select(met, new, old)
+        lane = lane._replace(modes=modes, contact=contact)
+    direction, clock = list(lane.direction), plan.clock(lane.s, lane.state)
+    for k, release in releases.items():
+        free, stop = release.landed, before[k] - to_event(0)
+        free = free & (contact[k] == 0) if len(releases) > 1 else free
+        direction[k] = jnp.where(free, -step.old.direction[k], direction[k])
+        lane = lane.log_event(step.taken & free, clock, EventKind.release, stop, jnp.nan)
+    return lane._replace(direction=tuple(direction))
+
+
+def _at_release(step: AppliedStep, lane: Lane, k: int, release: Release) -> Lane:
+    """Return the lane at the release of coordinate number k."""
     plan, flow, contact = step.plan, step.flow, lane.contact
     assert contact is not None
     free, offset = release.landed, stop_gradient(release.offset)
@@ -524,14 +576,10 @@ def _release_body(step: AppliedStep, lane: Lane, k: int, release: Release) -> La
         if not is_affine(plan.machine.coordinates[k].position, state):
             on_stops = _just_inside(plan, k, contact[k], on_stops)
         state = select(contact[k] > 0, on_stops, state)
-    direction = jnp.where(free, -step.old.direction[k], lane.direction[k])
-    s, stop = lane.s + jnp.where(free, offset, 0.0), contact[k] - to_event(0)
-    lane = lane.log_event(step.taken & free, plan.clock(s, state), EventKind.release, stop, jnp.nan)
     lane = lane.update_record(integrals=select(free, integrals, lane.record.integrals))
     return lane._replace(
-        s=s,
+        s=lane.s + jnp.where(free, offset, 0.0),
         state=select(free, state, lane.state),
-        direction=with_item(lane.direction, k, direction),
         contact=with_item(contact, k, jnp.where(free, 0.0, contact[k])),
     )
 
@@ -605,8 +653,8 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
         return lane
     rested = () if lane.record.events is None else before.contact or ()
     for k in limited_in(machine) if rested else ():  # an impact on another stop lifts a body
-        old, clock = rested[k], plan.clock(lane.s, lane.state)
-        lifted = step.taken & met & (old > 0) & (contact[k] == 0)
+        old, clock = jnp.abs(rested[k]), plan.clock(lane.s, lane.state)
+        lifted = step.taken & met & (old != 0) & (contact[k] == 0)
         lane = lane.log_event(lifted, clock, EventKind.release, old - to_event(0), jnp.nan)
     # It may release bodies on other stops. A stop may have changed the modes already.
     return release_pulled(plan, lane, step.taken, met, (at_event, before.modes), before.contact)

@@ -129,6 +129,8 @@ def inner_guards(
     slow = {k: jnp.zeros((), bool) for k in limited}
     if not plan.method.resolves(machine):
         slow = {k: _is_slow(plan, lane, k, stop_gradient(ends[k]), h) for k in limited}
+        if len(limited) > 1:
+            slow = {k: x & (contacts[k] == 0) for k, x in slow.items()}
 
     def pulls(s: Scalar, state: State) -> dict[int, Scalar]:
         found = {}
@@ -263,15 +265,16 @@ def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -
     beyond = stop.beyond(machine.coordinates[stop.coordinate].position(state))
     if lane.contact is None:
         return beyond
-    return jnp.where(lane.contact[stop.coordinate] > 0, -1.0, beyond)
+    return jnp.where(lane.contact[stop.coordinate] != 0, -1.0, beyond)
 
 
 # Newton's method on a smooth flow needs two or three attempts. If rounding prevents more accuracy,
 # a lane with this many attempts (a choice) accepts a thousand times the tolerance.
 _PATIENCE = 12.0
 
-# By these many attempts a place is bisected to rounding; a lane fails after 64.
-_LAST_ATTEMPTS = 56.0
+# A lane has failed after this many attempts without landing, by when a place is bisected to
+# rounding. The last eight accept rounding near an equilibrium. Choices.
+MOST_ATTEMPTS = 64.0
 
 # A guard above this share of its size (a choice) has jumped: rounding leaves less at an event.
 JUMPED = 1e-9
@@ -581,7 +584,8 @@ def _landed(
         shortest = 4 * eps * (plan.unit + jnp.abs(stop_gradient(lane.s)))
         shortest = jnp.where(jumped, jnp.maximum(plan.in_units(_SUDDEN), shortest), shortest)
         # Near an equilibrium on its surface, a guard is rounding and may be zero anywhere.
-        is_rounding = (lane.attempts >= _LAST_ATTEMPTS) & (jnp.abs(end.x) <= 16 * eps * guard.scale)
+        last = lane.attempts >= MOST_ATTEMPTS - 8
+        is_rounding = last & (jnp.abs(end.x) <= 16 * eps * guard.scale)
         found = (h <= shortest) & beyond(guard) | stop_gradient(is_rounding)
         sudden = pin_flag(aimed & ~near & found, h)
         landed, offset = landed | sudden, jnp.where(sudden, 0.0, offset)

@@ -44,12 +44,12 @@ from ..results import code
 from ..smooth import TIME, carried, hold_contacts, stops_are_exact
 from .aim import aim_ahead, aim_at
 from .arrive import after_jump, arrive, contacts_after_jump, release_pulled
+from .guards import MOST_ATTEMPTS
 from .impact import on_its_stops
 from .trial import Trial, try_step
 
-# A lane has failed after this many attempts without landing; with this many impacts in one interval
-# it was chattering. Both are choices: a smooth flow needs two or three attempts.
-_MOST_ATTEMPTS, _MOST_IMPACTS = 64.0, 16.0
+# A lane that fails with this many impacts in one interval was chattering: a choice.
+_MOST_IMPACTS = 16.0
 
 # No motion needs this many steps in one interval; a power of two, by choice.
 _MOST_STEPS = 65536.0
@@ -255,8 +255,8 @@ def _faults(
     ends = [
         *jams,
         (impacts > plan.max_impacts, code("chatter")),
-        (((new.attempts >= _MOST_ATTEMPTS) | (new.spent >= _MOST_STEPS)) & many, code("chatter")),
-        (new.attempts >= _MOST_ATTEMPTS, _reason_for_giving_up(plan, lane, new.target)),
+        (((new.attempts >= MOST_ATTEMPTS) | (new.spent >= _MOST_STEPS)) & many, code("chatter")),
+        (new.attempts >= MOST_ATTEMPTS, _reason_for_giving_up(plan, lane, new.target)),
         (new.steps >= plan.max_steps, code("max_steps")),
         (new.spent >= _MOST_STEPS, code("max_steps")),
     ]

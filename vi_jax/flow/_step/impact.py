@@ -472,6 +472,9 @@ def _hold_resting(
     resting, integrals = hold_contacts(plan.machine, modes, contact), lane.record.integrals
     flow = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
     end, still, passed = flow.extrapolate(pin(wait))
+    if has_contact_friction(plan.machine):
+        # A body that sticks has no slip, not even one of second order in the wait.
+        still = on_held_surfaces(plan.machine, end, still, modes, contact)
     if len(rests) > 1:  # another body may reach this one before its impacts are over
         clear = ~plan.beyond_a_stop(still)
         rests = {k: ends & clear for k, ends in rests.items()}

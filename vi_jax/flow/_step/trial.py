@@ -300,8 +300,8 @@ def _path(
     if lane.contact is not None and not stops_are_exact(plan.machine, lane.state):
         # Position and velocity of a resting body are known more accurately than from the state, if
         # the coordinate is a difference. Its force is that on a free body.
-        rests = lane.contact[k] > 0
-        place = at_stop(plan.machine, k, lane.contact[k], lambda stop: stop.place, begin.x)
+        rests, contact = lane.contact[k] != 0, jnp.abs(lane.contact[k])
+        place = at_stop(plan.machine, k, contact, lambda stop: stop.place, begin.x)
         begin, end = (
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)
