@@ -28,8 +28,7 @@ from vi_jax.plot.colors import DASHES
 jax.config.update("jax_enable_x64", True)
 
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
-from reproduction.boundaries import CURVES, follow_curves, plane_points, xi_per_c
-from reproduction.motions import table_damping_ratio
+from reproduction.boundaries import CURVES, TABLE_DAMPING, follow_curves, plane_points, xi_per_c
 from tools.ideal import births, closed_forms, machine
 from tools.pictures import legend_below, panels
 from tools.study import QUICK, say, write
@@ -37,7 +36,7 @@ from tools.tables import table
 
 SIDE = 48 if QUICK else 256
 SETTLE, RANGE = 400, (0.5, 1.9)  # drive cycles; ζ
-XI_PER_C, TABLE = xi_per_c(), table_damping_ratio()
+XI_PER_C, TABLE = xi_per_c(), TABLE_DAMPING
 ZETA, KS, CS = np.linspace(*RANGE, SIDE), np.linspace(0.05, 0.95, SIDE), np.linspace(0, 1.2, SIDE)
 Lanes = dict[str, np.ndarray]
 Curves = dict[str, list[np.ndarray]]
