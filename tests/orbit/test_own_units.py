@@ -82,6 +82,4 @@ def test_local_maps(kind):
         found = graze.touched.split()[0], str(graze.outcome), graze.forecast.period.tolist()
         first = first or (found, entries)
         assert found == first[0], case
-        # The kick of a soft stop is that of brief contacts, in which rounding is larger.
-        atol = 1e-5 if kind is Cushioned else 1e-6
-        np.testing.assert_allclose(entries, first[1], rtol=0, atol=atol)
+        np.testing.assert_allclose(entries, first[1], rtol=0, atol=1e-6)

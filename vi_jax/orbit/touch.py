@@ -58,7 +58,7 @@ def soft_kick(
     length = _SHARE * float(problem.period(x)) / problem.cycles
     (field, change), (y, deepest) = fields(u), deepest_at(length)
     deep_change, sizes = fields(deepest)[1], np.asarray(problem.sizes)[1:]
-    # A stiff stop pushes by rounding, up to the error of the touch's place.
+    # A stiff stop pushes by rounding.
     place_error = EXACT * np.abs(gradient) @ np.abs(u) / y**2
     largest = lambda rates: np.abs(rates / sizes).max()
     rounding = max(ROUNDING * largest(field), place_error * largest(deep_change))
@@ -229,7 +229,8 @@ def find_touches(
 
 @on_host
 def _at_touch(problem: Shooting, x, along, number: int, leg, s):
-    """Return the state, ∂h, a, h's derivative in the parameter, ∂(dh/ds), the kick at a touch."""
+    """Return the state, ∂h, h and its rates, h's derivative in the parameter, ∂(dh/ds), the kick at
+    a touch."""
 
     def distance(machine, s, u):
         return -guard_of(machine, number, s, problem.unravel(u), problem.modes_in(leg))
@@ -253,13 +254,13 @@ def _at_touch(problem: Shooting, x, along, number: int, leg, s):
         return ravel_pytree(state)[0]
 
     gradient = jax.grad(lambda u: distance(machine, s, u))(u)
-    fast, rate, kick = jax.grad(lambda u: rates(u).v)(u), rates(u).a, None
+    fast, here, kick = jax.grad(lambda u: rates(u).v)(u), rates(u), None
     if number < len(stops_of(machine)):
         push = fast / (fast @ fast)
         speed_unit = jnp.linalg.norm(gradient * problem.sizes[1:]) / problem.sizes[0]
         push_after = jax.jvp(after_jump, (u - _SLOW * speed_unit * push,), (push,))[1]
-        kick = -jnp.sqrt(2 * rate) * (push_after - push)
-    return u, gradient, rate, slope, fast, kick
+        kick = -jnp.sqrt(2 * here.a) * (push_after - push)
+    return u, gradient, here, slope, fast, kick
 
 
 def touch_at(
@@ -267,20 +268,25 @@ def touch_at(
 ) -> Touch:
     """Return one touch; `along` is the derivative of the motion with respect to the parameter."""
     event = events_of(problem.machine)[number]
-    u, gradient, rate, slope, fast, impact = _at_touch(problem, x, along, number, leg, clock)
+    u, gradient, here, slope, fast, impact = _at_touch(problem, x, along, number, leg, clock)
+    rate = float(here.a)
     if not rate > 0:
         raise NoLocalMapError(
             f"Argument `point` must be a grazing at which the motion turns, but the "
-            f"distance's second derivative is {float(rate):.3g} there."
+            f"distance's second derivative is {rate:.3g} there."
         )
     if impact is not None:
         kick = Kick(impact, 0.5)
     elif event.holds_mode:
-        kick = soft_kick(problem, x, number, leg, clock, u, gradient, fast, float(rate))
+        # A stiff stop pushes by what the corrector has left of distance and speed.
+        sizes = np.asarray(problem.sizes)[1:]
+        left, slopes = np.array([here.x, here.v]), np.stack([gradient, fast])
+        touching = u - sizes * np.linalg.lstsq(slopes * sizes, left, rcond=None)[0]
+        kick = soft_kick(problem, x, number, leg, clock, touching, gradient, fast, rate)
     else:
         called = Event(number).name_on(problem.machine)
         raise NoLocalMapError(
             "Argument `point` must be the grazing of a stop or a switch, but it touches the "
             f"{called}, whose jump does not vanish with the speed."
         )
-    return Touch(number, leg, clock, u, gradient, float(rate), float(slope), kick)
+    return Touch(number, leg, clock, u, gradient, rate, float(slope), kick)
