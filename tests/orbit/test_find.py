@@ -228,6 +228,19 @@ def test_the_search_accepts_every_section(section):
 
 
 @pytest.mark.slow
+def test_an_impact_next_to_the_section_keeps_its_energy():
+    """The section lies 1e-15 to 1e-12 before or after the impact of the same motion."""
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=1.0, damping_ratio=0.05)
+    run = vi.simulate(scene, scene.start(), 1, settle=300, impact_log=1)
+    for offset in (1e-15, -1e-15, 5e-15, -5e-15, 1e-12, -1e-12):
+        moved = scene.at_section(run.impact_log.phase[0, 0] + offset)
+        begin = vi.simulate(moved, moved.start(), 1, settle=301)
+        cycle = vi.find_orbit(moved, begin.last).trajectory()
+        assert cycle.impacts.tolist() == [1]
+        np.testing.assert_allclose(cycle.impact_energy, run.impact_energy, rtol=1e-11)
+
+
+@pytest.mark.slow
 def test_gradients_by_the_implicit_function_theorem():
     """Compare gradients of an extremum, an impact speed and a multiplier with differences."""
 
