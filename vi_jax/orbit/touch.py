@@ -40,10 +40,11 @@ class Kick(NamedTuple):
 
 def soft_kick(
     problem: Shooting, x: np.ndarray, number: int, leg: int, clock: float, u: np.ndarray,
-    gradient: np.ndarray, fast: np.ndarray, rate: float,
+    touching: np.ndarray, gradient: np.ndarray, fast: np.ndarray, rate: float,
 ) -> Kick:  # fmt: skip
-    """Return the kick of a switch that a motion grazes at this clock in the state u; `gradient` and
-    `fast` are the gradients of the distance h and of dh/ds, `rate` is d²h/ds²."""
+    """Return the kick of a switch that a motion grazes at this clock in the state u; `touching` is
+    that state without the error of its distance and speed, `gradient` and `fast` are the gradients
+    of the distance h and of dh/ds, `rate` is d²h/ds²."""
 
     def fields(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the field, and the change of the field beyond the surface."""
@@ -56,7 +57,7 @@ def soft_kick(
         return y, u - gradient / (gradient @ gradient) * y * y
 
     length = _SHARE * float(problem.period(x)) / problem.cycles
-    (field, change), (y, deepest) = fields(u), deepest_at(length)
+    (field, change), (y, deepest) = fields(touching), deepest_at(length)
     deep_change, sizes = fields(deepest)[1], np.asarray(problem.sizes)[1:]
     # A stiff stop pushes by rounding.
     place_error = EXACT * np.abs(gradient) @ np.abs(u) / y**2
@@ -282,7 +283,7 @@ def touch_at(
         sizes = np.asarray(problem.sizes)[1:]
         left, slopes = np.array([here.x, here.v]), np.stack([gradient, fast])
         touching = u - sizes * np.linalg.lstsq(slopes * sizes, left, rcond=None)[0]
-        kick = soft_kick(problem, x, number, leg, clock, touching, gradient, fast, rate)
+        kick = soft_kick(problem, x, number, leg, clock, u, touching, gradient, fast, rate)
     else:
         called = Event(number).name_on(problem.machine)
         raise NoLocalMapError(
