@@ -43,8 +43,14 @@ def test_sweeps_in_single_precision(kind):
         assert_same_sweeps(kind)
 
 
+@pytest.mark.parametrize("double", [True, False], ids=["double", "single"])
 @pytest.mark.parametrize("kind", REGIONS)
-def test_basins(kind):
+def test_basins(kind, double):
+    with jax.enable_x64(double):
+        assert_same_basins(kind)
+
+
+def assert_same_basins(kind):
     first = None
     for machine in variants(kind):
         scale = {n: machine.scales[i] for i, n in enumerate(kind.names)}
