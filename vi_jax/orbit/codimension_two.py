@@ -70,8 +70,8 @@ class Vectors(NamedTuple):
     right: np.ndarray
 
 
-# A function of a point on a curve that is zero at a point of codimension two. It also returns the
-# null vectors that it used, if any, with the signs of those of a nearby point.
+# A function of a step along a curve, and of the vectors of a nearby step. It returns a value, which
+# is zero at a point of codimension two, and its own vectors with the same signs, or `None`.
 Test = Callable[[Step, Vectors | None], tuple[float, Vectors | None]]
 
 

@@ -521,9 +521,9 @@ def _next_goal(plan: Plan, lane: Lane, trial: Trial, found: _Found) -> tuple[Fla
             # An event may have come before the one that was met: step to the force's extremum.
             hidden, place = found.windows[k]
             goal = goal.cut(hidden & ~met, place)
-            left, landed, place, _ = path.near.release
+            left, released, place, _ = path.near.release
             goal = _Goal(
-                event=goal.event & ~landed | left,
+                event=goal.event & ~released | left,
                 before=goal.before & ~left,
                 length=jnp.where(left, place, goal.length),
                 target=jnp.where(left, to_release(k), goal.target),

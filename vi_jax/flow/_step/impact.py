@@ -413,9 +413,15 @@ def _may_be_last(
     are over within several times the time of `_remaining_chatter`, under the force before the
     impact or that of a motion of this size. An impact that it misses is followed by a slower one.
     """
-    limit = stop_gradient(jnp.asarray(longest_step(plan.machine, lane.s, lane.state)))
-    brief = _SURELY_LONGER * (_BRIEF if lane.s.dtype == jnp.float64 else _BRIEF_SINGLE)
-    return stop_gradient(speed) * limit <= brief * (force * limit * limit + size)
+    limit, share = _longest_chatter(plan, lane)
+    return stop_gradient(speed) * limit <= _SURELY_LONGER * share * (force * limit * limit + size)
+
+
+def _longest_chatter(plan: Plan, lane: Lane) -> tuple[Scalar, float]:
+    """Return the longest step, and the share of it for which a remaining chatter is completed."""
+    s = lane.s
+    limit = stop_gradient(jnp.asarray(longest_step(plan.machine, s, lane.state), s.dtype))
+    return limit, _BRIEF if s.dtype == jnp.float64 else _BRIEF_SINGLE
 
 
 def _near_contacts(
@@ -594,7 +600,7 @@ def _remaining_chatter(
     force = pressing * (1 - impact.share)
     ends = force > 0
     time = jnp.where(ends, 2 * speed / jnp.where(ends, force, 1.0), jnp.inf)
-    limit = stop_gradient(jnp.asarray(longest_step(plan.machine, s, state), s.dtype))
+    limit, share = _longest_chatter(plan, lane)
     # Hops no higher than rounding cannot be resolved, however long they last.
     height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
     growth = force_rate(free, body, free, s, at_rest)
@@ -603,7 +609,7 @@ def _remaining_chatter(
     size = plan.extent(k) + jnp.abs(gap)
     flat = stop_gradient(height) <= 16 * float(jnp.finfo(s.dtype).eps) * size
     time = jnp.where(not_yet, wait, time)
-    brief = (_BRIEF if s.dtype == jnp.float64 else _BRIEF_SINGLE) * limit
+    brief = share * limit
     ends = stop_gradient(time) <= jnp.where(flat, 0.1 * limit, brief)
     ends = ends & (flat | ~not_yet | (hop <= brief))
     ends = ends & (distance <= (0.5 * jnp.maximum(pressing, 0.0) * brief + speed) * brief)

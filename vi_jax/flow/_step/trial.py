@@ -198,11 +198,9 @@ def try_step(
         stages = stages if method.adaptive else separate_stages(stages)
     else:
         new, integrals, error = method.step(smooth, lane.s, s1, lane.state, integrals)
-    rests = None
-    if lane.contact is not None and not method.holds(machine):
-        rests = lane.contact[0] > 0
-        new = select(rests, lane.state, new)
-    new = pin(new)
+    stands = None if lane.contact is None or method.holds(machine) else lane.contact[0] > 0
+    held = lambda new: new if stands is None else select(stands, lane.state, new)
+    new = pin(held(new))
     bodies = range(len(machine.coordinates))
     free_machines = tuple(hold_contacts(machine, lane.modes, lane.contact, but=k) for k in bodies)
     ends: list[tuple[Rates, Rates]] = []
@@ -215,8 +213,7 @@ def try_step(
     def at(share: Scalar) -> State:
         if motion is not None:
             return motion.at(share * h)[0]
-        inside = method.step(smooth, lane.s, lane.s + share * h, lane.state, {})[0]
-        return inside if rests is None else select(rests, lane.state, inside)
+        return held(method.step(smooth, lane.s, lane.s + share * h, lane.state, {})[0])
 
     longest = jnp.asarray(limit)
     inner = inner_guards(plan, lane, free_machines, ends, stages, at, h, longest)
