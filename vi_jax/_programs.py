@@ -22,7 +22,13 @@ import numpy as np
 from jax.core import Tracer
 
 from ._checks import unwritable
-from .lanes import Unsupported, current_backend, raise_interrupts_within, vector_only
+from .lanes import (
+    Unsupported,
+    current_backend,
+    raise_interrupts_within,
+    vector_only,
+    without_collection,
+)
 
 # With these options XLA compiles two to three times faster. Most of the run time is spent in the
 # lanes, whose code XLA does not compile. `PLAIN` alone saves half of the compile time and costs no
@@ -125,7 +131,7 @@ class CompiledFunction:
         self, function: Callable[..., Any], quick: Mapping[str, Any] = _QUICK, **options: Any
     ):
         functools.update_wrapper(self, function)
-        self._function, self._quick_options = _without_collection(function), quick
+        self._function, self._quick_options = function, quick
         self._compiled = eqx.filter_jit(self._function, **options)
         # Structures of arguments whose lanes cannot be vector code. With the quick options XLA's
         # loops would be slow.
@@ -148,7 +154,7 @@ class CompiledFunction:
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         """Return the function's result, computed by its compiled program. **Raises:**
         `KeyboardInterrupt`, also for an interrupt during the call that Python dropped."""
-        with raise_interrupts_within():
+        with raise_interrupts_within(), without_collection():
             return self._called(arguments, keywords)
 
     def _called(self, arguments: tuple, keywords: dict[str, Any]) -> Any:
@@ -179,23 +185,6 @@ def _kind_of(*arguments: Any) -> Any:
     except TypeError:
         return None
     return kind
-
-
-def _without_collection(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function without garbage collection while it is traced. Tracing leaves little
-    garbage but creates so many objects that the collector would run again and again."""
-
-    @functools.wraps(function)
-    def traced(*arguments: Any, **keywords: Any) -> Any:
-        enabled = gc.isenabled()
-        gc.disable()
-        try:
-            return function(*arguments, **keywords)
-        finally:
-            if enabled:
-                gc.enable()
-
-    return traced
 
 
 def is_outermost(*arguments: Any) -> bool:

@@ -373,8 +373,9 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
                 f"`machine.at(...)` returns, but got {state!r}."
             )
     try:
-        place, velocity = _evaluated(machine, lambda x, z: (x.position(z), x.velocity(z)), state)
-        shape = jnp.shape(place) or jnp.shape(velocity)
+        both = lambda x, z: [jnp.asarray(part(z)) for part in (x.position, x.velocity)]
+        place, velocity = eqx.filter_eval_shape(both, machine, state)
+        shape = place.shape or velocity.shape
     except (AttributeError, TypeError, LookupError) as error:
         raise TypeError(
             f"Argument `{argument}` must be a state of this machine, but got {state!r}: "

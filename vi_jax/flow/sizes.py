@@ -189,10 +189,11 @@ def extents_of(
         if contact and isinstance(event, ContactFriction):  # it holds a resting body
             k = stops_of(machine)[event.stop].coordinate
             rest = (*contact[:k], jnp.full_like(s, 1.0 + event.stop), *contact[k + 1 :])
-        mode = mode_number(machine, number)
-        values = (jnp.full_like(s, x) for x in event.sized_in)
-        both_modes = ((*modes[:mode], x, *modes[mode + 1 :]) for x in values)
-        extents.append(tuple(of_guard(number, x, rest) for x in both_modes))
+        mode, values = mode_number(machine, number), jnp.asarray(event.sized_in, s.dtype)
+        by_mode = lambda x, n=number, m=mode, r=rest: of_guard(
+            n, (*modes[:m], x, *modes[m + 1 :]), r
+        )
+        extents.append(tuple(jax.vmap(by_mode)(values)))  # traced once for both modes
     return stop_gradient(tuple(extents))
 
 

@@ -20,7 +20,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from ._arrays import MOST_IN_REGISTERS
 from ._derivative import forward, widened
 from ._program import LaneProgram, batch_of, dependent_parts, shape_of
-from ._shared import set_within
+from ._shared import set_within, without_collection
 from ._vector import Unsupported
 from .call import header, register_handler
 from .runtime import AnyProgram, kernel_of
@@ -282,6 +282,7 @@ def _lowered(ctx, *args, program: LaneProgram, backend: str):
     return lower_to_kernel(ctx, args, program, otherwise)
 
 
+@without_collection()
 def lower_to_kernel(ctx, args, program: AnyProgram, otherwise: Callable[[], Any]):
     """Lower to a call of a program's kernel. Without a kernel, warn and return `otherwise()`;
     within `vector_only` raise `Unsupported` instead."""

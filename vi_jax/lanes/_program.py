@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
+from ._shared import without_collection
 from .elementary import horner
 
 
@@ -32,7 +33,8 @@ class Part:
 
     @functools.cached_property
     def closed(self) -> ClosedJaxpr:
-        return jax.make_jaxpr(self.function)(*map(shape_of, self.in_avals))
+        with without_collection():
+            return jax.make_jaxpr(self.function)(*map(shape_of, self.in_avals))
 
 
 class LaneProgram(eqx.Module):
@@ -277,23 +279,31 @@ def rewritten(closed: ClosedJaxpr, rule: Callable[[Any], Any]) -> ClosedJaxpr:
 
 
 def _rewritten(jaxpr: Jaxpr, rule: Callable[[Any], Any]) -> Jaxpr:
-    eqns = []
-    for eqn in map(rule, jaxpr.eqns):
-        if eqn.primitive.name not in OWN_DERIVATIVE:
-            eqn = eqn.replace(params={k: _parameter(x, rule) for k, x in eqn.params.items()})
-        eqns.append(eqn)
-    return jaxpr.replace(eqns=eqns)
+    of_closed, of_open = lambda x: rewritten(x, rule), lambda x: _rewritten(x, rule)
+    return jaxpr.replace(
+        eqns=[with_mapped_bodies(rule(eqn), of_closed, of_open) for eqn in jaxpr.eqns]
+    )
 
 
-def _parameter(value: object, rule: Callable[[Any], Any]) -> Any:
-    if isinstance(value, ClosedJaxpr):
-        return rewritten(value, rule)
-    if isinstance(value, Jaxpr):
-        return _rewritten(value, rule)
-    if isinstance(value, tuple) and any(isinstance(x, ClosedJaxpr) for x in value):
-        found = [_parameter(x, rule) for x in value]
-        return type(value)(*found) if hasattr(value, "_fields") else tuple(found)
-    return value
+def with_mapped_bodies(
+    eqn: Any, of_closed: Callable[[ClosedJaxpr], Any], of_open: Callable[[Jaxpr], Any]
+) -> Any:
+    """Return an equation whose inner jaxprs are replaced. One with its own derivative rule stays as
+    it is, since the rule belongs to the body."""
+    if eqn.primitive.name in OWN_DERIVATIVE or not bodies(eqn):
+        return eqn
+
+    def mapped(value: object) -> Any:
+        if isinstance(value, ClosedJaxpr):
+            return of_closed(value)
+        if isinstance(value, Jaxpr):
+            return of_open(value)
+        if isinstance(value, tuple) and any(isinstance(x, ClosedJaxpr) for x in value):
+            found = [mapped(x) for x in value]
+            return type(value)(*found) if hasattr(value, "_fields") else tuple(found)
+        return value
+
+    return eqn.replace(params={name: mapped(x) for name, x in eqn.params.items()})
 
 
 def bodies(eqn: Any) -> list[Jaxpr]:

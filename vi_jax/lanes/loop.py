@@ -19,6 +19,7 @@ from jax.core import Tracer, eval_jaxpr
 from jax.extend.core import ClosedJaxpr
 
 from . import _backward as _backward  # registers the reverse mode of `lanes_p`
+from ._merge import merged
 from ._primitive import lanes_p
 from ._program import LaneProgram, Part, shape_of
 from ._shared import Recent, set_within
@@ -229,8 +230,9 @@ def _traced(functions: Functions, treedef: Any, leaves: list[Any], rows: int) ->
 
     both = [*leaves, *map(shape_of, carried)]
     jaxprs = [begin, jax.make_jaxpr(stepped)(*both), jax.make_jaxpr(ended)(*both)]
-    (begin, step, end), consts = _consts_as_inputs(jaxprs, n)
-    program = LaneProgram(parts=(Part.of(begin), Part.of(step), Part.of(end)), rows=rows)
+    jaxprs, consts = _consts_as_inputs(jaxprs, n)
+    begin, step, end = (Part.of(merged(jaxpr)) for jaxpr in jaxprs)
+    program = LaneProgram(parts=(begin, step, end), rows=rows)
     return Traced(program, consts, structures["out"], structures["row"])
 
 

@@ -1,0 +1,116 @@
+"""Merging equal equations of a jaxpr, so that each is differentiated and written once.
+
+JAX traces what a function writes: the sine of an angle in the mass matrix, in its derivative and in
+the force becomes three equations.
+"""
+
+import copy
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from ._program import with_mapped_bodies
+
+# A call of at most so many equations is written inline, such as those of `jnp.where`: a choice. A
+# step has some hundred of them, whose equations could not be merged.
+_SMALL = 8
+
+
+@functools.lru_cache(maxsize=1024)  # so that a jaxpr that several equations share stays one object
+def merged(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """Return a jaxpr with the same results in which no two equations are equal, and without those
+    that no result needs; its inner jaxprs too. Small calls are inlined."""
+    return closed.replace(jaxpr=_merged(closed.jaxpr))
+
+
+@functools.lru_cache(maxsize=1024)
+def _merged(jaxpr: Jaxpr) -> Jaxpr:
+    writer = _Writer()
+    outs = writer.append(jaxpr.eqns, {}, jaxpr.outvars)
+    return jaxpr.replace(eqns=_needed(writer.eqns, outs), outvars=outs)
+
+
+class _Writer:
+    """The equations of a jaxpr while they are merged."""
+
+    def __init__(self):
+        self.eqns: list[Any] = []
+        self._found: dict[Any, Sequence[Any]] = {}
+
+    def append(
+        self, eqns: Sequence[Any], known: dict[Any, Any], results: Sequence[Any], inlined=False
+    ) -> list[Any]:
+        """Append equations, and return the atoms for `results`. `known`, which is changed, has the
+        atoms that stand for variables. The variables of an `inlined` body are replaced by new ones,
+        since the body may be called again."""
+
+        def read(atom: Any) -> Any:
+            return atom if isinstance(atom, Literal) else known.get(atom, atom)
+
+        for eqn in eqns:
+            given = [read(a) for a in eqn.invars]
+            body = _small_body(eqn)
+            if body is not None:
+                arguments = dict(zip(body.invars, given, strict=True))
+                outs = self.append(body.eqns, arguments, body.outvars, inlined=True)
+            else:
+                outs = self._one(
+                    with_mapped_bodies(eqn, merged, _merged).replace(invars=given), inlined
+                )
+            known.update(zip(eqn.outvars, outs, strict=True))
+        return [read(a) for a in results]
+
+    def _one(self, eqn: Any, inlined: bool) -> Sequence[Any]:
+        """Append an equation unless an equal one exists, and return its variables."""
+        key = _key(eqn)
+        found = self._found.get(key)
+        # An unused result may have a variable of another type, which no equation can read.
+        if found is not None and [*map(type, found)] == [*map(type, eqn.outvars)]:
+            return found
+        if inlined:
+            eqn = eqn.replace(outvars=[*map(copy.copy, eqn.outvars)])
+        self.eqns.append(eqn)
+        if key is not None:
+            self._found[key] = eqn.outvars
+        return eqn.outvars
+
+
+def _small_body(eqn: Any) -> Jaxpr | None:
+    """Return the body of a call that is written inline, merged; `None` for other equations."""
+    if eqn.primitive.name != "jit":
+        return None
+    closed = eqn.params["jaxpr"]
+    if closed.consts or len(closed.jaxpr.eqns) > _SMALL or closed.effects:
+        return None
+    return _merged(closed.jaxpr)
+
+
+def _key(eqn: Any) -> Any:
+    """Return a key that is equal only for equations with equal results; `None` if unknown."""
+    if eqn.effects:
+        return None
+    params = tuple(sorted((k, x) for k, x in eqn.params.items() if k != "name"))
+    key = eqn.primitive, params, tuple(map(_atom_key, eqn.invars))
+    try:
+        hash(key)
+    except TypeError:
+        return None
+    return key
+
+
+def _atom_key(atom: Any) -> Any:
+    if not isinstance(atom, Literal):
+        return atom
+    return atom.aval, np.asarray(atom.val, atom.aval.dtype).tobytes()
+
+
+def _needed(eqns: Sequence[Any], outs: Sequence[Any]) -> list[Any]:
+    wanted, kept = {a for a in outs if not isinstance(a, Literal)}, []
+    for eqn in reversed(eqns):
+        if eqn.effects or any(v in wanted for v in eqn.outvars):
+            kept.append(eqn)
+            wanted.update(a for a in eqn.invars if not isinstance(a, Literal))
+    return kept[::-1]
