@@ -21,7 +21,8 @@ from .elementary import elementwise_primitive
 # in derivatives of a machine's motion.
 
 
-def _divided(eqn: Any) -> Any:
+def as_quotient(eqn: Any) -> Any:
+    """Return an equation, with this derivative if it divides floating-point numbers."""
     if eqn.primitive.name == "div" and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
         return eqn.replace(primitive=quotient_p, params={})
     return eqn
@@ -29,7 +30,7 @@ def _divided(eqn: Any) -> Any:
 
 def with_quotients(closed: ClosedJaxpr) -> ClosedJaxpr:
     """Return the jaxpr with this derivative for its divisions of floating-point numbers."""
-    return rewritten(closed, _divided)
+    return rewritten(closed, as_quotient)
 
 
 def _jvp(primals, tangents):

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from ._derivative import as_quotient
 from ._program import with_mapped_bodies
 
 # A call of at most so many equations is written inline, such as those of `jnp.where`: a choice. A
@@ -19,25 +20,36 @@ from ._program import with_mapped_bodies
 _SMALL = 8
 
 
-@functools.lru_cache(maxsize=1024)  # so that a jaxpr that several equations share stays one object
-def merged(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """Return a jaxpr with the same results in which no two equations are equal, and without those
-    that no result needs; its inner jaxprs too. Small calls are inlined."""
-    return closed.replace(jaxpr=_merged(closed.jaxpr))
+def merged(*jaxprs: ClosedJaxpr) -> list[ClosedJaxpr]:
+    """Return jaxprs with the same results, in each of which no two equations are equal and each is
+    needed; their inner jaxprs too. Small calls are inlined. Floating-point divisions become
+    quotients, which have a better derivative."""
+    merger = _Merger()
+    return [merger.closed(x) for x in jaxprs]
 
 
-@functools.lru_cache(maxsize=1024)
-def _merged(jaxpr: Jaxpr) -> Jaxpr:
-    writer = _Writer()
-    outs = writer.append(jaxpr.eqns, {}, jaxpr.outvars)
-    return jaxpr.replace(eqns=_needed(writer.eqns, outs), outvars=outs)
+class _Merger:
+    """A jaxpr that several equations share stays one object. The cache does not outlive the call,
+    so that the original jaxprs can be freed."""
+
+    def __init__(self):
+        self.closed, self.open = functools.cache(self._closed), functools.cache(self._open)
+
+    def _closed(self, closed: ClosedJaxpr) -> ClosedJaxpr:
+        return closed.replace(jaxpr=self.open(closed.jaxpr))
+
+    def _open(self, jaxpr: Jaxpr) -> Jaxpr:
+        writer = _Writer(self)
+        outs = writer.append(jaxpr.eqns, {}, jaxpr.outvars)
+        return jaxpr.replace(eqns=_needed(writer.eqns, outs), outvars=outs)
 
 
 class _Writer:
     """The equations of a jaxpr while they are merged."""
 
-    def __init__(self):
+    def __init__(self, merger: _Merger):
         self.eqns: list[Any] = []
+        self._merger = merger
         self._found: dict[Any, Sequence[Any]] = {}
 
     def append(
@@ -54,12 +66,12 @@ class _Writer:
             given = [read(a) for a in eqn.invars]
             body = _small_body(eqn)
             if body is not None:
+                body = self._merger.open(body)
                 arguments = dict(zip(body.invars, given, strict=True))
                 outs = self.append(body.eqns, arguments, body.outvars, inlined=True)
             else:
-                outs = self._one(
-                    with_mapped_bodies(eqn, merged, _merged).replace(invars=given), inlined
-                )
+                eqn = with_mapped_bodies(as_quotient(eqn), self._merger.closed, self._merger.open)
+                outs = self._one(eqn.replace(invars=given), inlined)
             known.update(zip(eqn.outvars, outs, strict=True))
         return [read(a) for a in results]
 
@@ -79,13 +91,13 @@ class _Writer:
 
 
 def _small_body(eqn: Any) -> Jaxpr | None:
-    """Return the body of a call that is written inline, merged; `None` for other equations."""
+    """Return the body of a call that is written inline; `None` for other equations."""
     if eqn.primitive.name != "jit":
         return None
     closed = eqn.params["jaxpr"]
     if closed.consts or len(closed.jaxpr.eqns) > _SMALL or closed.effects:
         return None
-    return _merged(closed.jaxpr)
+    return closed.jaxpr
 
 
 def _key(eqn: Any) -> Any:

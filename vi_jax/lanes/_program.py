@@ -272,17 +272,18 @@ def evaluate_inlined(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:
 
 @functools.lru_cache(maxsize=256)
 def rewritten(closed: ClosedJaxpr, rule: Callable[[Any], Any]) -> ClosedJaxpr:
-    """Return a jaxpr with `rule(equation)` for each equation, in inner jaxprs too. Bodies of
-    calls with a derivative rule are not changed."""
+    """Return a jaxpr with `rule(equation)` for each equation, in inner jaxprs too; the same object
+    if nothing changes. Bodies of calls with a derivative rule are not changed."""
     # The cache keeps a jaxpr that several equations share one object, differentiated once.
-    return closed.replace(jaxpr=_rewritten(closed.jaxpr, rule))
+    jaxpr = _rewritten(closed.jaxpr, rule)
+    return closed if jaxpr is closed.jaxpr else closed.replace(jaxpr=jaxpr)
 
 
 def _rewritten(jaxpr: Jaxpr, rule: Callable[[Any], Any]) -> Jaxpr:
     of_closed, of_open = lambda x: rewritten(x, rule), lambda x: _rewritten(x, rule)
-    return jaxpr.replace(
-        eqns=[with_mapped_bodies(rule(eqn), of_closed, of_open) for eqn in jaxpr.eqns]
-    )
+    eqns = [with_mapped_bodies(rule(eqn), of_closed, of_open) for eqn in jaxpr.eqns]
+    is_same = all(a is b for a, b in zip(eqns, jaxpr.eqns, strict=True))
+    return jaxpr if is_same else jaxpr.replace(eqns=eqns)
 
 
 def with_mapped_bodies(
@@ -300,10 +301,14 @@ def with_mapped_bodies(
             return of_open(value)
         if isinstance(value, tuple) and any(isinstance(x, ClosedJaxpr) for x in value):
             found = [mapped(x) for x in value]
+            if all(a is b for a, b in zip(found, value, strict=True)):
+                return value
             return type(value)(*found) if hasattr(value, "_fields") else tuple(found)
         return value
 
-    return eqn.replace(params={name: mapped(x) for name, x in eqn.params.items()})
+    found = {name: mapped(x) for name, x in eqn.params.items()}
+    is_same = all(x is found[name] for name, x in eqn.params.items())
+    return eqn if is_same else eqn.replace(params=found)
 
 
 def bodies(eqn: Any) -> list[Jaxpr]:

@@ -231,7 +231,7 @@ def _traced(functions: Functions, treedef: Any, leaves: list[Any], rows: int) ->
     both = [*leaves, *map(shape_of, carried)]
     jaxprs = [begin, jax.make_jaxpr(stepped)(*both), jax.make_jaxpr(ended)(*both)]
     jaxprs, consts = _consts_as_inputs(jaxprs, n)
-    begin, step, end = (Part.of(merged(jaxpr)) for jaxpr in jaxprs)
+    begin, step, end = map(Part.of, merged(*jaxprs))
     program = LaneProgram(parts=(begin, step, end), rows=rows)
     return Traced(program, consts, structures["out"], structures["row"])
 
