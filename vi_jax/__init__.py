@@ -1,6 +1,7 @@
 """vi_jax: differentiable, vectorised simulation of vibro-impact systems."""
 
 import ast
+import gc
 import importlib
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,27 @@ _HOMES = {
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
+def _loaded(module: str) -> Any:
+    """Import a module of this package, without the garbage collection that its many objects would
+    cause: a tenth of the time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        return importlib.import_module(f".{module}", __name__)
+    finally:
+        if enabled:
+            gc.enable()
+
+
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return importlib.import_module("._messages", __name__).installed_version()
+        return _loaded("_messages").installed_version()
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home = _HOMES[name]
     if home is None:
-        return importlib.import_module(f".{name}", __name__)
-    value = getattr(importlib.import_module(f".{home}", __name__), name)
+        return _loaded(name)
+    value = getattr(_loaded(home), name)
     return globals().setdefault(name, value)
 
 
