@@ -9,6 +9,7 @@ from collections.abc import Callable
 from math import pi
 from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -218,16 +219,22 @@ def rounding_bounds(
     large, a velocity as `least / unit`."""
     if stops_are_exact(machine, state):
         return 0.0, 0.0
-    body = machine.coordinates[k]
-    return _bound(body.position, state, least), _bound(body.velocity, state, least / unit)
+    return _bounds(machine, k, state, jnp.asarray(least), jnp.asarray(least / unit))
 
 
-def _bound(part: Callable[[State], Scalar], state: State, least: Scalar | float) -> Scalar:
-    state = stop_gradient(state)
-    slopes = jax.grad(lambda x: jnp.sum(part(x)))(state)
-    terms = jtu.tree_map(lambda slope, x: jnp.sum(jnp.abs(slope * x)), slopes, state)
-    size = sum(jtu.tree_leaves(terms), start=jnp.asarray(least))
-    return stop_gradient(16 * jnp.finfo(size.dtype).eps * size)
+@eqx.filter_jit  # a step calls it often, and derivatives of gaps are long
+def _bounds(
+    machine: AbstractMachine, k: int, state: State, place: Scalar, speed: Scalar
+) -> tuple[Scalar, Scalar]:
+    body, state = machine.coordinates[k], stop_gradient(state)
+
+    def bound(part: Callable[[State], Scalar], least: Scalar) -> Scalar:
+        slopes = jax.grad(lambda x: jnp.sum(part(x)))(state)
+        terms = jtu.tree_map(lambda slope, x: jnp.sum(jnp.abs(slope * x)), slopes, state)
+        size = sum(jtu.tree_leaves(terms), start=least)
+        return stop_gradient(16 * jnp.finfo(size.dtype).eps * size)
+
+    return bound(body.position, place), bound(body.velocity, speed)
 
 
 def guard_rounding(size: Scalar) -> Scalar:
