@@ -12,7 +12,7 @@ from differences import some
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 STUDIES = sorted([*FOLDER.glob("studies/*.py"), *FOLDER.glob("benchmarks/*.py")])
-WITHOUT_FIGURE = {"gpu", "first_calls", "delays"}
+WITHOUT_FIGURE = {"gpu", "first_calls", "delays", "regimes"}
 # These need the extra `bench`, or JiTCDDE.
 RUN_ELSEWHERE = {"peers", "chains", "delays"}
 # These run with the slow tests, the others before a release; Pyright checks their calls.
