@@ -54,11 +54,9 @@ class Row(vi.Mechanical):
     """Two bodies in a row; the first is driven and strikes a stop."""
 
     q = ("a", "b")
+    mass = 1.0, 0.5
     omega: Any = 1.0
     gap: Any = 1.1
-
-    def mass(self, q):
-        return 1.0, 0.5
 
     @property
     def cycle(self):
@@ -77,11 +75,9 @@ class Coupled(vi.Mechanical):
     """Two coupled van der Pol oscillators; the first one is driven."""
 
     q = ("x", "y")
+    mass = 1.0, 1.0
     omega: Any = 1.15
     coupling: Any = 0.3
-
-    def mass(self, q):
-        return 1.0, 1.0
 
     @property
     def cycle(self):
@@ -100,7 +96,7 @@ def _scene(damping: float) -> vi.Scene:
 # For each machine: its name, itself, a start, and the ranges of its parameters.
 UNDAMPED, DAMPED = _scene(0.0), _scene(0.02)
 RATIO, GAP, RESTITUTION = "drive.frequency_ratio", "stops.0.gap", "stops.0.restitution"
-MACHINES = (
+MACHINES: Any = (
     ("map of a ring", Ring(), vi.State(x=0.3, y=0.1), {"a": (0, 1), "b": (-0.2, 1.6)}),
     ("two bodies with a stop", Row(), Row().at(), {"omega": (0.95, 1.03), "gap": (1.0, 1.2)}),
     (
@@ -145,7 +141,7 @@ def main() -> None:
     names = {"quasiperiodic": "quasi-periodic"}
     codes = {int(x): names.get(x.name, x.name) for x in vi.REGIMES}
     for name, machine, start, ranges in MACHINES:
-        axes = {leaf: rng.uniform(*bounds, LANES) for leaf, bounds in ranges.items()}
+        axes = {leaf: rng.uniform(low, high, LANES) for leaf, (low, high) in ranges.items()}
         data = vi.scan(
             machine, axes, start=start, measure="regime", settle=SETTLE, paired=True,
             progress=False,

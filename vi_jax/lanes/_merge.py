@@ -116,7 +116,8 @@ def _key(eqn: Any) -> Any:
 def _atom_key(atom: Any) -> Any:
     if not isinstance(atom, Literal):
         return atom
-    return atom.aval, np.asarray(atom.val, atom.aval.dtype).tobytes()
+    aval: Any = atom.aval
+    return aval, np.asarray(atom.val, aval.dtype).tobytes()
 
 
 def _needed(eqns: Sequence[Any], outs: Sequence[Any]) -> list[Any]:
