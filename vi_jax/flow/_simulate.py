@@ -42,9 +42,9 @@ from .lane import Record
 from .loop import Ends, run_lane
 from .methods import MethodLike
 from .noise import with_noise
-from .sizes import row_sizes
 from .plan import Plan
 from .results import Errors, EventLog, ImpactLog, Run, Samples, outcome_of, raised, reason_of
+from .sizes import row_sizes
 from .smooth import TIME, means
 
 _CPU_OPTIONS = {

@@ -253,7 +253,8 @@ class Plan(eqx.Module):
             reduced=zero if self.records_motion and is_compound(self.machine) else None,
             log=jnp.full((5, self.log), jnp.nan, Y.dtype) if self.log else None,
             clearance=(jnp.full_like(Y, jnp.inf),) * max(1, len(limited_in(self.machine)))
-            if self.records_motion and self.log else None,
+            if self.records_motion and self.log
+            else None,
             events=jnp.full((4, self.events), jnp.nan, Y.dtype) if self.events else None,
         )
 
