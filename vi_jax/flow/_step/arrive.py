@@ -37,7 +37,7 @@ from ..results import EventKind, code_of_outcome
 from ..sizes import guard_rounding
 from ..smooth import hold_contacts, in_modes, is_affine, stops_are_exact
 from .event_derivatives import FlowToEvent
-from .guards import JUMPED, Crossing, furthest_landing
+from .guards import Crossing, furthest_landing, jump_share
 from .impact import (
     bring_to_rest,
     on_its_stops,
@@ -243,7 +243,7 @@ def _guard_jumped(
     was = guard_of(plan.machine, number, lane.s, old, modes_before, contact)
     now = guard_of(plan.machine, number, lane.s, lane.state, lane.modes, contact)
     was, now = stop_gradient((was, now))
-    slack = JUMPED * (plan.guard_extent(number, lane) + jnp.abs(now))
+    slack = jump_share(now) * (plan.guard_extent(number, lane) + jnp.abs(now))
     return when & (was <= slack) & (now > slack)
 
 

@@ -276,9 +276,6 @@ _PATIENCE = 12.0
 # rounding. The last eight accept rounding near an equilibrium. Choices.
 MOST_ATTEMPTS = 64.0
 
-# A guard above this share of its size (a choice) has jumped: rounding leaves less at an event.
-JUMPED = 1e-9
-
 # The place of a jump within a step is bisected to this length (in s): a choice.
 _SUDDEN = 1e-12
 
@@ -406,7 +403,7 @@ def _mark_jump(guard: Crossing) -> Crossing:
     `_from_below` takes for zero in a guard that falls."""
     x, eps = stop_gradient(guard.begin.x), float(jnp.finfo(guard.scale.dtype).eps)
     zero = eps**0.5 * guard.scale if guard.zero is None else guard.zero
-    return guard._replace(above=x > JUMPED * jnp.abs(x) + zero)
+    return guard._replace(above=x > jump_share(x) * jnp.abs(x) + zero)
 
 
 def at_stops(plan: Plan, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
@@ -580,7 +577,7 @@ def _landed(
     sudden, jumped = None, None
     if guard.above is not None:
         # A guard without a slope is followed further, to the clock's rounding.
-        jumped = stop_gradient(end.x) > JUMPED * guard.scale
+        jumped = stop_gradient(end.x) > jump_share(h) * guard.scale
         shortest = 4 * eps * (plan.unit + jnp.abs(stop_gradient(lane.s)))
         shortest = jnp.where(jumped, jnp.maximum(plan.in_units(_SUDDEN), shortest), shortest)
         # Near an equilibrium on its surface, a guard is rounding and may be zero anywhere.
@@ -611,6 +608,12 @@ def landing_tolerance(x: Scalar) -> float:
 def furthest_landing(x: Scalar) -> float:
     """Return the largest trusted |δ|: near grazing, or after many attempts."""
     return max(turn_tolerance(x), 1e3 * landing_tolerance(x))
+
+
+def jump_share(x: Scalar) -> float:
+    """Return the share of its size above which a guard has jumped: rounding leaves less at an
+    event. The first is a choice; in single precision it is the rounding of a guard."""
+    return max(1e-9, 64 * float(jnp.finfo(x.dtype).eps))
 
 
 def turn_tolerance(x: Scalar) -> float:
