@@ -269,7 +269,7 @@ def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -
 
 
 # Newton's method on a smooth flow needs two or three attempts. If rounding prevents more accuracy,
-# a lane with this many attempts (a choice) accepts a thousand times the tolerance.
+# a lane with this many attempts (a choice) accepts a multiple of the tolerance (`_patient`).
 _PATIENCE = 12.0
 
 # A lane has failed after this many attempts without landing, by when a place is bisected to
@@ -595,8 +595,16 @@ def _landed(
 
 
 def tolerance_factor(plan: Plan, lane: Lane) -> Scalar:
-    """Return the factor of a lane's landing tolerance: its unit, and 1,000 after many attempts."""
-    return plan.in_units(jnp.where(lane.attempts >= _PATIENCE, 1e3, jnp.ones_like(lane.attempts)))
+    """Return the factor of a lane's landing tolerance: its unit, and `_patient` after many
+    attempts."""
+    one = jnp.ones_like(lane.attempts)
+    return plan.in_units(jnp.where(lane.attempts >= _PATIENCE, _patient(one), one))
+
+
+def _patient(x: Scalar) -> float:
+    """Return the factor of the landing tolerance after many attempts: in single precision 0.1 would
+    be another event."""
+    return 1e3 if x.dtype == jnp.float64 else 10.0
 
 
 def landing_tolerance(x: Scalar) -> float:
@@ -607,7 +615,7 @@ def landing_tolerance(x: Scalar) -> float:
 
 def furthest_landing(x: Scalar) -> float:
     """Return the largest trusted |δ|: near grazing, or after many attempts."""
-    return max(turn_tolerance(x), 1e3 * landing_tolerance(x))
+    return max(turn_tolerance(x), _patient(x) * landing_tolerance(x))
 
 
 def jump_share(x: Scalar) -> float:
