@@ -93,14 +93,19 @@ class Hammer(vi.Mechanical):
 
 def ends(kind, given, cycles, method="standard", **start):
     """Return the last positions of many machines, and whether all motions succeeded."""
+    places, good = each_end(kind, given, cycles, method, **start)
+    return places, bool(good.all())
+
+
+def each_end(kind, given, cycles, method="standard", **start):
+    """Return the last position of many machines, and whether each motion succeeded."""
 
     def last(given):
         machine = kind(**given)
         run = vi.simulate(machine, machine.at(**start), cycles, method=method)
         return jnp.stack([getattr(run.last, x) for x in machine.q]), run.successful
 
-    places, good = jax.jit(jax.vmap(last))(jax.tree.map(jnp.asarray, given))
-    return np.asarray(places), bool(good.all())
+    return map(np.asarray, jax.jit(jax.vmap(last))(jax.tree.map(jnp.asarray, given)))
 
 
 @pytest.mark.slow
@@ -121,6 +126,33 @@ def test_static_friction_lets_go_on_a_belt(method):
     ]  # fmt: skip
     assert good
     np.testing.assert_allclose(found, expected, atol=2e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:vi_jax is running in single precision")
+@pytest.mark.parametrize("kind", [Belt, Blocks])
+def test_single_precision(kind):
+    """Regression: of these 96 machines 8 and 11 were lost. Guards counted as jumped by rounding,
+    and small forces of friction as ties. One was off by 3e-3: an event was accepted far from its
+    place. One of each is still lost: rounding turns a body that sticks, or the body that begins to
+    slip sticks again."""
+    draw, n = np.random.default_rng(5).uniform, 96
+    if kind is Belt:
+        start = dict(a=0.2, b=0.3)
+        ranges = dict(
+            w=(0.4, 1.5), level=(0.1, 1), between=(0.1, 0.8), ratio=(1, 1.5), size=(0.1, 0.6),
+            drift=(-0.3, 0.3), drive=(0.2, 1.0),
+        )  # fmt: skip
+        given = {name: draw(*x, n) for name, x in ranges.items()}
+    else:
+        start = dict(a=0.8, b=0.3, c=-0.4)
+        given = dict(w=draw(0.4, 1.5, n), levels=draw(0.1, 0.8, (n, 3)))
+    expected, all_good = ends(kind, given, 3, **start)
+    assert all_good
+    with jax.enable_x64(False):
+        found, good = each_end(kind, given, 3, **start)
+    assert np.sum(~good) <= 1
+    np.testing.assert_allclose(found[good], expected[good], rtol=0, atol=1e-4)
 
 
 @pytest.mark.slow

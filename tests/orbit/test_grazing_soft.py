@@ -36,15 +36,17 @@ def soft_grazing(stiffness=30.0, **options):
 def test_orders_and_kicks_of_soft_stops():
     """Over a parabola of depth, a spring of stiffness K gives the impulse K (4/3) √(2/a) y³. At a
     prestress F0 the field jumps, and the body turns back with the acceleration a + F0. A dashpot
-    that cannot pull gives an impulse of order y²."""
-    for stiffness in (1e8, 30.0):
+    that cannot pull gives an impulse of order y². A contact that is less deep than rounding is
+    refused: regression, 5 % off at 1e9, and a damped one of another order."""
+    for stiffness in (1e9, 1e8, 30.0):
         found = vi.grazing(soft_grazing(stiffness), check=False)
         assert found.order[0] == 1.5 and found.rate[0] == pytest.approx(SWING, rel=1e-9)
         impulse = -stiffness * 4 / 3 * np.sqrt(2 / SWING)
         np.testing.assert_allclose(found.kick[0], [0, impulse], rtol=2e-3, atol=2e-3 * -impulse)
     assert found.outcome == vi.SCENARIOS.persistence
-    with pytest.raises(ValueError, match=r"a stop that is less stiff: .* Take a `RigidStop`"):
-        vi.grazing(soft_grazing(1e10), check=False)
+    for stiffness, damping in ((1e10, 0.0), (1e9, 0.6)):
+        with pytest.raises(ValueError, match=r"a stop that is less stiff: .* Take a `RigidStop`"):
+            vi.grazing(soft_grazing(stiffness, damping=damping), check=False)
     found = vi.grazing(soft_grazing(prestress=2.0))
     assert found.order[0] == 0.5
     kick = -2 * 2.0 * np.sqrt(2 * SWING) / (SWING + 2.0)

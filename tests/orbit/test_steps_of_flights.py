@@ -51,6 +51,20 @@ def test_a_branch_takes_more_steps_for_a_slow_drive():
     np.testing.assert_allclose(product, np.exp(-0.1 * periods), atol=1e-9)
 
 
+@pytest.mark.slow
+def test_energies_of_a_branch_have_the_steps_of_its_flights():
+    """Regression: with fewer steps than the flights, they were off by 6e-11."""
+    machine = Oscillator(omega=0.8, gap=1.0)
+    start = vi.OscillatorState(jnp.asarray(0.1), jnp.asarray(0.0))
+    start = vi.simulate(machine, start, 1, settle=200).last
+    orbit = vi.find_orbit(machine, start, throw=True)
+    branch = vi.continue_orbit(orbit, parameter="omega", bounds=(0.71, 0.81), progress=False)
+    for n in (0, len(branch.parameter) // 2):
+        at, fine = Oscillator(branch.parameter[n], 1.0), vi.FixedStep(steps_per_cycle=400)
+        exact = vi.simulate(at, branch.at(branch.parameter[n])[0].state, 1, method=fine)
+        assert branch.impact_energy[n] == pytest.approx(float(exact.impact_energy[0]), rel=1e-12)
+
+
 @pytest.mark.exhaustive
 def test_flights_of_a_long_period_have_the_steps_of_the_longest():
     """Compare the multipliers of a motion with twelve impacts in sixteen cycles with the cycle map,

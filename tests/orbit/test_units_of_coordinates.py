@@ -42,6 +42,9 @@ def test_clearance_of_the_nearest_stop(unit):
     """It is that of the stop that is nearest as a share of the motion, here the second body's."""
     machine = Uncoupled(unit)
     orbit = vi.find_orbit(machine, machine.at(), throw=True)
+    near = 1 - 0.3 / np.hypot(1 - OMEGA**2, 0.3 * OMEGA)
+    for found in (orbit, vi.simulate(machine, orbit.state, 3, impact_log=1)):
+        np.testing.assert_allclose(found.clearance, near, rtol=0, atol=1e-9)
     bounds = (0.1, 0.7)
     branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=bounds, progress=False)
     swing = branch.parameter / np.hypot(1 - OMEGA**2, 0.3 * OMEGA)

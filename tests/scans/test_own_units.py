@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from own_units import MACHINES, Belted, Cranked, Cushioned, Heater, Struck, Valve, variants
+from own_units import MACHINES, Heater, Struck, Valve, variants
 
 pytestmark = pytest.mark.slow
 
@@ -22,7 +22,10 @@ def assert_same_sweeps(kind, first=None):
     values = np.linspace(*kind.bounds, 6)
     for machine in variants(kind):
         run = vi.sweep(machine, "p", values, start=machine.start(), settle=200, progress=False)
-        found = run.period, np.where(run.period > 0, run.impacts, 0)
+        # Near an equilibrium turns are rounding, and without them a cycle does not end.
+        moves = run.y_max - run.y_min > 1e-4 * np.abs(run.y_max)
+        found = [np.where(moves, x, 0) for x in (run.period, run.impacts)]
+        found[1] = np.where(found[0] > 0, found[1], 0)
         first = found if first is None else first
         case = f"{machine.scales} {machine.phase} {machine.is_flipped}"
         for x, y in zip(found, first, strict=True):
@@ -35,10 +38,8 @@ def test_sweeps(kind):
     assert_same_sweeps(kind)
 
 
-@pytest.mark.parametrize("kind", [x for x in MACHINES if x not in (Belted, Cranked, Cushioned)])
+@pytest.mark.parametrize("kind", MACHINES)
 def test_sweeps_in_single_precision(kind):
-    """The others have long transients or motions without a period. The body on a belt comes to
-    rest on its section, where in single precision a lane may end."""
     with jax.enable_x64(False):
         assert_same_sweeps(kind)
 

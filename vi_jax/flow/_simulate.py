@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.flatten_util import ravel_pytree
 from jax.interpreters import ad
 from jaxtyping import Array, Int
 
@@ -22,10 +23,13 @@ from ..machine import (
     as_logged,
     cycle_time,
     frequency_ratio,
+    in_rows,
     labels_in,
+    limited_in,
     modes_of,
     others_of,
     outcomes_of,
+    size_of,
     stated,
     stop_in_words,
     stops_of,
@@ -40,6 +44,7 @@ from .methods import MethodLike
 from .noise import with_noise
 from .plan import Plan
 from .results import Errors, EventLog, ImpactLog, Run, Samples, outcome_of, raised, reason_of
+from .sizes import row_sizes
 from .smooth import TIME, means
 
 _CPU_OPTIONS = {
@@ -236,7 +241,10 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         length = jnp.asarray(machine.cycle, period.dtype) if times is None else duration
         sums = {name: per_cycle(x, jnp.sum) for name, x in integrals.items()}
         averages = means(sums, length)
-    quantities = _quantities(plan, points)
+    quantities, clearance = _quantities(plan, points), None
+    if records.clearance is not None:
+        distances = [per_cycle(x, jnp.min) for x in records.clearance]
+        clearance = _nearest(machine, points, distances)
     dense = None
     if sampled:
         interval = jnp.repeat(period / parts, parts) if times is None else times
@@ -252,7 +260,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         rests=as_counts(per_cycle(records.rests, jnp.sum)),
         reduced=as_counts(per_cycle(records.reduced, jnp.sum)),
         impact_energy=per_cycle(records.impact_energy, jnp.sum),
-        clearance=per_cycle(records.clearance, jnp.min),
+        clearance=clearance,
         duration=duration,
         frequency_ratio=None if duration is None else frequency_ratio(machine, duration),
         samples=dense,
@@ -271,6 +279,21 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         outcomes=outcomes_of(machine),
         **_outcome(machine, lane),
     )
+
+
+def _nearest(machine: AbstractMachine, points: State, distances: list[Array]) -> Array:
+    """Return the distances (of each coordinate that stops limit, by cycle) of the coordinate that
+    comes nearest to one of its stops, as a share of its motion: others may have another unit."""
+    if len(distances) == 1:
+        return distances[0]
+    start = jtu.tree_map(lambda x: x[0], points)
+    size, unravel = row_sizes(machine, start, in_rows(points)), ravel_pytree(start)[1]
+    of_coordinates = [
+        size_of(machine.coordinates[k].position, start, unravel(size)) for k in limited_in(machine)
+    ]
+    found = jnp.stack(distances)
+    shares = jnp.nanmin(found, axis=1) / jnp.stack(of_coordinates)
+    return found[jnp.argmin(jax.lax.stop_gradient(shares))]
 
 
 def _outcome(machine: AbstractMachine, lane: Ends) -> dict[str, Any]:

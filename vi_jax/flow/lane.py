@@ -69,7 +69,9 @@ class Record(NamedTuple):
     """Number of impacts with less than their restitution, since they would gain energy."""
     log: Float[Array, "5 size"] | None
     """Clock, V⁻, stop and impulses of each impact; unused columns are NaN."""
-    clearance: Scalar | None
+    clearance: Scalars | None
+    """For each coordinate that stops limit, the smallest distance at a turn before one of them;
+    one number without stops."""
     events: Float[Array, "4 listed"] | None
     """Clock, kind, number and value of each event; unused columns are NaN."""
 

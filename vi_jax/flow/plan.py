@@ -16,6 +16,7 @@ from ..machine import (
     events_of,
     is_autonomous,
     is_compound,
+    limited_in,
     mode_number,
     others_of,
     own_modes,
@@ -251,7 +252,9 @@ class Plan(eqx.Module):
             rests=zero if self.records_motion and self.rests else None,
             reduced=zero if self.records_motion and is_compound(self.machine) else None,
             log=jnp.full((5, self.log), jnp.nan, Y.dtype) if self.log else None,
-            clearance=jnp.full_like(Y, jnp.inf) if self.records_motion and self.log else None,
+            clearance=(jnp.full_like(Y, jnp.inf),) * max(1, len(limited_in(self.machine)))
+            if self.records_motion and self.log
+            else None,
             events=jnp.full((4, self.events), jnp.nan, Y.dtype) if self.events else None,
         )
 

@@ -541,7 +541,9 @@ class Run(Summarized):
     to rest, times the mass on which the impact acts."""
     clearance: Float[Array, " cycles"] | None
     """Smallest distance to a stop at which the body turned back in each cycle without touching it;
-    infinite if it did not. It is recorded if `impact_log` is set."""
+    infinite if it did not. If stops limit several coordinates, it is that of the coordinate that
+    comes nearest during the run, as a share of its motion. It is recorded if `impact_log` is set.
+    """
     duration: Float[Array, " cycles"] | None
     """Time τ that each cycle took."""
     frequency_ratio: Float[Array, " cycles"] | None

@@ -26,7 +26,7 @@ SOLVED, UNSOLVED, WORKING = 0.0, 1.0, 2.0
 # Rows whose number would be below this many roundings after a pivot are ties, which the order of
 # rows decides. With a threshold relative to each number, 16 % of planar problems of four contacts
 # ended in rays that do not exist.
-_TIES = 4096.0
+_TIES, _TIES_SINGLE = 4096.0, 64.0
 
 # Shares below are relative to numbers that are known to at most this many roundings: a choice.
 _ROUNDINGS = 64.0
@@ -51,7 +51,13 @@ def _share(share: float, x: Array) -> float:
 def released_share(x: Array) -> float:
     """Return the share by which a force that has become too large exceeds friction at least, above
     ties in the precision of `x`."""
-    return max(_RELEASED, 64 * _TIES * float(jnp.finfo(x.dtype).eps))
+    return max(_RELEASED, 64 * _tie(x))
+
+
+def _tie(x: Array) -> float:
+    """Return the share of the largest number up to which numbers are ties."""
+    roundings = _TIES if x.dtype == jnp.float64 else _TIES_SINGLE
+    return roundings * float(jnp.finfo(x.dtype).eps)
 
 
 class Contacts(NamedTuple):
@@ -100,7 +106,7 @@ def lemke(matrix: Array, constant: Array) -> tuple[Array, Array, Array]:
     rows, columns = np.arange(m), np.arange(2 * m + 2)
     eps = float(jnp.finfo(dtype).eps)
     size = jnp.maximum(jnp.max(jnp.abs(matrix)), float(jnp.finfo(dtype).tiny))
-    least, tie = _TIES * eps, _TIES * eps * (1 + jnp.max(jnp.abs(constant)))
+    least, tie = _tie(constant), _tie(constant) * (1 + jnp.max(jnp.abs(constant)))
     # Columns: w, z, the artificial variable, the right side.
     parts = np.eye(m), -matrix, -np.ones((m, 1)), constant[:, None]
     table = jnp.concatenate([jnp.asarray(x, dtype) for x in parts], 1)

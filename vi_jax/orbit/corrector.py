@@ -18,8 +18,8 @@ from jaxtyping import Array, Float, Int
 
 from .._programs import compiled
 from .._types import Flag, Scalar, State
-from ..flow import simulate
-from ..machine import frequency_ratio, own_modes, phase_at, with_modes
+from ..flow import AbstractMethod, ImplicitSteps, simulate
+from ..machine import frequency_ratio, own_modes, phase_at, scales_known, with_modes
 from .equations import Shooting, Unknowns
 from .results import ORBIT_RESULTS, Orbit
 from .tolerances import CORRECTED, LISTED, ROUGHLY
@@ -203,6 +203,31 @@ def since_section(problem: Shooting, x: Unknowns, clock: Any) -> Any:
     return np.mod(clock - begin, float(problem.period(x)))
 
 
+# Flights have at least 16 steps, and 2 % more than the longest step demands (`steps_of`).
+_ALMOST = 1.1
+
+
+def steps_depend_on_motion(problem: Shooting) -> bool:
+    """Return whether the number of steps depends on the motion, as its pace may be slow."""
+    machine = problem.machine
+    paced = machine.pace(jnp.zeros(()), problem.like) is not None
+    return paced or not scales_known(machine) or isinstance(problem.method, ImplicitSteps)
+
+
+def method_of_runs(problem: Shooting, xs: Sequence[Unknowns]) -> AbstractMethod:
+    """Return the method with about as many steps in a cycle as the flights of these solutions, if
+    that number depends on the motion; host-side. Doubled steps need few programs."""
+    method, s = problem.method, jnp.zeros(())
+    if not steps_depend_on_motion(problem):
+        return method
+    for x in xs:
+        machine, legs = problem.at(x), problem.lengths(x).max() / float(problem.period(x))
+        needed = problem.steps / (legs * problem.cycles)
+        while needed > _ALMOST * float(machine.cycle / method.longest(machine, s, problem.like)):
+            method = method.tighter()
+    return method
+
+
 def _first_state(problem: Shooting, x: Unknowns) -> State:
     """Return the state on the first section of a solution, with the machine's own modes."""
     sections, (legs, _), _ = sections_at(problem, x)
@@ -215,6 +240,7 @@ def hits_of(problem: Shooting, step: Step, state: State | None = None) -> Hits:
     """Return the impacts of a solution; `state`, if known, is its state on the section."""
     if problem.landings:
         state = _first_state(problem, step.x) if state is None else state
+        problem = dataclasses.replace(problem, method=method_of_runs(problem, [step.x]))
         count, *listed = map(np.asarray, _simulate_impacts(problem, jnp.asarray(step.x), state))
         clock, speed, stop = (a[listed[2] >= 0] for a in listed)
         return Hits(clock, speed, stop.astype(np.int32), int(count))
@@ -244,6 +270,7 @@ def energies_of(problem: Shooting, steps: Sequence[Step]) -> np.ndarray:
     """Return the energy that impacts take in a cycle, averaged over the period, at each step."""
     xs = [jnp.asarray(step.x) for step in steps]
     states = jax.tree.map(lambda *x: jnp.stack(x), *(_first_state(problem, x) for x in xs))
+    problem = dataclasses.replace(problem, method=method_of_runs(problem, xs))
     return np.asarray(_impact_energies(problem, jnp.stack(xs), states))
 
 

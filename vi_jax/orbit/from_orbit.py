@@ -53,7 +53,6 @@ from ..machine import (
     phase_at,
     raveled,
     renews,
-    scales_known,
     section_in,
     section_number,
     size_of,
@@ -64,7 +63,7 @@ from ..machine import (
     with_modes,
     without_modes,
 )
-from .corrector import on_host, step_error
+from .corrector import on_host, step_error, steps_depend_on_motion
 from .equations import Shooting, Unknowns
 from .flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
 from .results import Orbit
@@ -124,15 +123,6 @@ def longest_leg(
 def cycles_to_fly(problem: Shooting, x: Unknowns) -> int:
     places, _, period = problem.values(x)
     return longest_leg(places, problem.events, period, problem.cycles)
-
-
-def method_of_runs(problem: Shooting, x: Unknowns) -> AbstractMethod:
-    """Return the method with as many steps in a cycle as the flights of a solution have."""
-    method, share = problem.method, problem.lengths(x).max() / float(problem.period(x))
-    steps = ceil(problem.steps / (float(share) * problem.cycles))
-    if not isinstance(method, FixedStep) or steps <= method.steps_per_cycle:
-        return method
-    return dataclasses.replace(method, steps_per_cycle=steps)
 
 
 @compiled
@@ -223,18 +213,24 @@ def equations_along(
     blank = Shooting(machine, method, like, cycles, (), (), steps, parameters)
     states, modes = _follow_events(blank, state, found, period)
     _check_instants(blank, found, states, modes)
-    while steps_depend_on_motion(blank) and 2 * blank.steps <= _MOST:
-        before = states
-        blank = dataclasses.replace(blank, steps=2 * blank.steps)
-        states, modes = _follow_events(blank, state, found, period)
-        if np.max(np.abs(states - before) / _sizes(blank, states)) < CORRECTED:
-            break  # keep the finer one: flights may need more steps along the branch
-        blank = dataclasses.replace(blank, method=blank.method.tighter())
+    if steps_depend_on_motion(blank):
+        halved = dataclasses.replace(blank, steps=max(1, blank.steps // 2))
+        before, _ = _follow_events(halved, state, found, period)
+        # Of two that agree keep the finer one: flights may need more steps along the branch.
+        while _differ(blank, states, before) and 2 * blank.steps <= _MOST:
+            before, method = states, blank.method.tighter()
+            blank = dataclasses.replace(blank, steps=2 * blank.steps, method=method)
+            states, modes = _follow_events(blank, state, found, period)
     problem = dataclasses.replace(blank, events=events, modes=modes)
     states = states[:-1] if found else states
     values = np.array([leaf(machine, name) for name in parameters])
     x = problem.pack(np.asarray(clocks), states, values, period)
     return with_sizes(problem, x), np.asarray(x)
+
+
+def _differ(problem: Shooting, states: np.ndarray, before: np.ndarray) -> bool:
+    change = np.abs(states - before) / _sizes(problem, states)
+    return not np.max(change) < CORRECTED
 
 
 def _ends(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> list[Scalar]:
@@ -296,13 +292,6 @@ def _check_instants(
                     "Combine simultaneous events in one, and begin cycles where no guard jumps."
                 )
         previous = place
-
-
-def steps_depend_on_motion(problem: Shooting) -> bool:
-    """Return whether the number of steps depends on the motion, as its pace may be slow."""
-    machine = problem.machine
-    paced = machine.pace(jnp.zeros(()), problem.like) is not None
-    return paced or not scales_known(machine) or isinstance(problem.method, ImplicitSteps)
 
 
 def with_finer_steps(problem: Shooting, x: Unknowns, error: float) -> Shooting | None:

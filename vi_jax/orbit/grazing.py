@@ -17,7 +17,7 @@ from .._checks import count, flag, instance_of
 from .._messages import Interrupted, at_work, count_of
 from ..flow import simulate
 from ..machine import Stated, Summarized, in_rows, in_unit, stated, stops_of
-from .corrector import on_host
+from .corrector import method_of_runs, on_host
 from .equations import Shooting
 from .flight import Event
 from .forecast import (
@@ -78,8 +78,9 @@ def simulate_attractors(graze: LocalGrazing, offsets: np.ndarray) -> SimulatedAt
     problem, section, local = graze.problem, graze.section, graze.map
     value = float(graze.x[-1])
     smooth = section.state + np.outer(offsets, section.slope)
+    of_runs = dataclasses.replace(problem, method=method_of_runs(problem, [graze.x]))
     rows, impacts, is_finite = _simulate_lanes(
-        problem, value + offsets, smooth, problem.cycles * SOUGHT,
+        of_runs, value + offsets, smooth, problem.cycles * SOUGHT,
         transient_length(local) * problem.cycles,
     )  # fmt: skip
     displacements = rows[:, problem.cycles - 1 :: problem.cycles] - smooth[:, None]

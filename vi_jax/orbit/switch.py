@@ -15,12 +15,21 @@ from ..flow import simulate
 from ..machine import after_event, others_of, with_leaf
 from .codimension_two import PERIODS
 from .conditions import AbstractCondition, FixedComponent, Special, bifurcation_tests
-from .corrector import Step, advance, jacobian_at, orbit_of, sections_at, state_at, tangent_at
+from .corrector import (
+    Step,
+    advance,
+    jacobian_at,
+    method_of_runs,
+    orbit_of,
+    sections_at,
+    state_at,
+    tangent_at,
+)
 from .edit_events import admissible_near, over_periods, repeated, without_events
 from .equations import Shooting
 from .find import find_orbit
 from .flight import Event
-from .from_orbit import events_in, method_of_runs
+from .from_orbit import events_in
 from .kinds import (
     CROSSING,
     DOUBLING,
@@ -162,7 +171,7 @@ def _search(
             guesses.append(jax.tree.map(lambda x: x[0], sections_at(problem, near_step.x)[0]))
     sense = np.copysign(1.0, float(step.tangent[-1]))
     n = problem.cycles
-    options: Any = {"method": method_of_runs(problem, step.x)}
+    options: Any = {"method": method_of_runs(problem, [step.x])}
     for side in (sense, -sense):
         value = point.parameter + side * distance * float(point.scale[-1])
         machine = with_leaf(problem.machine, problem.parameters[-1], value)

@@ -16,14 +16,24 @@ from .flight import Event, Flight
 from .tolerances import BRIEF, EXACT, LOCATED, ROUNDING
 from .turns import Path, turning_points
 
-# Duration of the first contact in cycles; each further contact has a quarter of it; most contacts;
-# measured powers that agree within this have converged; steps of a flight. Choices.
-_SHARE, _TRIES, _AGREE, _STEPS = 0.02, 10, 0.03, 8
+# Duration of the first contact in cycles; each further contact has half of it; most contacts;
+# measured powers that agree within the first number have converged, at rounding those within the
+# second; steps of a flight. Choices.
+_SHARE, _TRIES, _AGREE, _SIMILAR, _STEPS = 0.02, 12, 1e-3, 0.03, 4
 
 # The first contact is so brief that the stop adds less than this share to the acceleration that
 # turns the motion back anyway. A deeper contact with a stiff stop is an impact, with other powers.
 # A choice, with which the kick of a spring is correct to 1e-3.
 _WEAK = 0.03
+
+
+# Share of a kick that may be rounding.
+_NOISE = 3e-3
+
+_TOO_STIFF = (
+    "Argument `point` must be a grazing of a stop that is less stiff: a contact so brief that it "
+    "bends the motion little is less deep than rounding. Take a `RigidStop`."
+)
 
 
 class NoLocalMapError(ValueError):
@@ -54,15 +64,16 @@ def soft_kick(
     def deepest_at(length: float) -> tuple[float, np.ndarray]:
         """Return the root of the depth of a contact of this length, and the state there."""
         y = length * np.sqrt(rate / 8)
-        return y, u - gradient / (gradient @ gradient) * y * y
+        return y, touching - gradient / (gradient @ gradient) * y * y
 
     length = _SHARE * float(problem.period(x)) / problem.cycles
     (field, change), (y, deepest) = fields(touching), deepest_at(length)
     deep_change, sizes = fields(deepest)[1], np.asarray(problem.sizes)[1:]
     # A stiff stop pushes by rounding.
-    place_error = EXACT * np.abs(gradient) @ np.abs(u) / y**2
+    place = float(np.abs(gradient) @ np.abs(u))
+    depth_error = 4 * np.finfo(float).eps * place
     largest = lambda rates: np.abs(rates / sizes).max()
-    rounding = max(ROUNDING * largest(field), place_error * largest(deep_change))
+    rounding = max(ROUNDING * largest(field), EXACT * place / y**2 * largest(deep_change))
     if largest(change) > rounding:
         rate_beyond = rate + float(fast @ change)
         if rate_beyond <= 0:
@@ -81,20 +92,28 @@ def soft_kick(
     orders: list[float] = []
     for _ in range(_TRIES):
         y, deepest = deepest_at(length)
-        measured.append((y, _change_by_contact(problem, x, number, leg, clock, deepest, length)))
+        # An error of the depth is an impulse by a spring, its change one by a dashpot.
+        speed = np.sqrt(2 * rate) * y
+        dashpot = fields(touching - fast / (fast @ fast) * speed)[1] / speed
+        error = 2 * np.sqrt(2 / rate) / y * largest(fields(deepest)[1]) + largest(dashpot)
+        kick = _change_by_contact(problem, x, number, leg, clock, deepest, length)
+        if depth_error * error > _NOISE * largest(kick):
+            break
+        measured.append((y, kick))
         if len(measured) > 1:
             (y0, k0), (y1, k1) = measured[-2:]
             order = log2(np.linalg.norm(k0 / sizes) / np.linalg.norm(k1 / sizes))
-            order /= 2 * log2(y0 / y1)
-            orders.append(order)
-            if len(orders) > 1 and abs(orders[-1] - orders[-2]) < _AGREE:
-                break
-        length /= 4
+            orders.append(order / (2 * log2(y0 / y1)))
+        if len(orders) > 1 and abs(orders[-1] - orders[-2]) < _AGREE:
+            break
+        length /= 2
+    if len(orders) < 2 or abs(orders[-1] - orders[-2]) > _SIMILAR:
+        raise NoLocalMapError(_TOO_STIFF)
     order = round(2 * orders[-1]) / 2 if abs(orders[-1] % 0.5 - 0.25) > 0.2 else orders[-1]
     (y0, k0), (y1, k1) = measured[-2:]
     first, second = k0 / y0 ** (2 * order), k1 / y1 ** (2 * order)
-    # The error of the first falls by four with the length, as its size does.
-    return Kick(second + (second - first) / 3, order)
+    # The error of the first falls with the length, as its size does.
+    return Kick(2 * second - first, order)
 
 
 def _modes_around_switch(problem: Shooting, machine, number, leg, s, u):
@@ -129,11 +148,7 @@ def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np
     def root(function: Any, low: float, high: float) -> float:
         guard = lambda s1: float(function(s1)[1])
         if guard(low) * guard(high) > 0:
-            raise NoLocalMapError(
-                "Argument `point` must be a grazing of a stop that is less stiff: a contact so "
-                "brief that it bends the motion little is less deep than rounding. Take a "
-                "`RigidStop`."
-            )
+            raise NoLocalMapError(_TOO_STIFF)
         found: Any = brentq(guard, low, high, xtol=1e-15 * unit)
         return float(found)
 

@@ -20,10 +20,10 @@ from .._checks import count, from_host, given_number
 from .._messages import Interrupted, ReportProgress, at_work, warn
 from .._types import Vector
 from ..machine import nearest_images
-from .corrector import Step, advance, distance_along, on_host, step_error
+from .corrector import Step, advance, distance_along, on_host, step_error, steps_depend_on_motion
 from .edit_events import half_difference, repeats_from
 from .equations import Shooting
-from .from_orbit import COARSE, steps_depend_on_motion, with_finer_steps, with_grown_sizes
+from .from_orbit import COARSE, with_finer_steps, with_grown_sizes
 from .locate import locate_zero
 from .special import Point
 from .tolerances import EXACT, LOCATED, ROUGHLY, SAME

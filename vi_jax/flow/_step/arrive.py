@@ -1,6 +1,6 @@
 """The end of a step: impacts, rest, changes of mode and resets, and the record of the interval."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ from ..results import EventKind, code_of_outcome
 from ..sizes import guard_rounding
 from ..smooth import hold_contacts, in_modes, is_affine, stops_are_exact
 from .event_derivatives import FlowToEvent
-from .guards import JUMPED, Crossing, furthest_landing
+from .guards import Crossing, furthest_landing, jump_share
 from .impact import (
     bring_to_rest,
     on_its_stops,
@@ -243,7 +243,7 @@ def _guard_jumped(
     was = guard_of(plan.machine, number, lane.s, old, modes_before, contact)
     now = guard_of(plan.machine, number, lane.s, lane.state, lane.modes, contact)
     was, now = stop_gradient((was, now))
-    slack = JUMPED * (plan.guard_extent(number, lane) + jnp.abs(now))
+    slack = jump_share(now) * (plan.guard_extent(number, lane) + jnp.abs(now))
     return when & (was <= slack) & (now > slack)
 
 
@@ -660,9 +660,9 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
     return release_pulled(plan, lane, step.taken, met, (at_event, before.modes), before.contact)
 
 
-def _extremes(step: AppliedStep, places: Scalars) -> dict[str, Scalar | None]:
-    """Return the extremes of Y in this interval so far, and the smallest distance to a stop at a
-    turning point; `None` if not recorded. `places` are Y at the step's end and before a jump."""
+def _extremes(step: AppliedStep, places: Scalars) -> dict[str, Any]:
+    """Return the extremes of Y in this interval so far, and the smallest distances to stops at
+    turning points; `None` if not recorded. `places` are Y at the step's end and before a jump."""
     plan, lane, trial, taken = step.plan, step.old, step.trial, step.taken
     record = lane.record
     y_max, y_min, clearance = record.y_max, record.y_min, record.clearance
@@ -680,7 +680,8 @@ def _extremes(step: AppliedStep, places: Scalars) -> dict[str, Scalar | None]:
             if lane.contact is not None:
                 turns_short = turns_short & (lane.contact[k] == 0)
             distance = jnp.where(turns_short, -stop.beyond(tops[k]), jnp.inf)
-            clearance = jnp.minimum(clearance, distance)
+            i = limited_in(plan.machine).index(k)
+            clearance = with_item(clearance, i, jnp.minimum(clearance[i], distance))
     for place in (*places[1:], end_position):
         y_max = jnp.where(taken, jnp.maximum(y_max, place), y_max)
         y_min = jnp.where(taken, jnp.minimum(y_min, place), y_min)

@@ -269,15 +269,12 @@ def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -
 
 
 # Newton's method on a smooth flow needs two or three attempts. If rounding prevents more accuracy,
-# a lane with this many attempts (a choice) accepts a thousand times the tolerance.
+# a lane with this many attempts (a choice) accepts a multiple of the tolerance (`_patient`).
 _PATIENCE = 12.0
 
 # A lane has failed after this many attempts without landing, by when a place is bisected to
 # rounding. The last eight accept rounding near an equilibrium. Choices.
 MOST_ATTEMPTS = 64.0
-
-# A guard above this share of its size (a choice) has jumped: rounding leaves less at an event.
-JUMPED = 1e-9
 
 # The place of a jump within a step is bisected to this length (in s): a choice.
 _SUDDEN = 1e-12
@@ -406,7 +403,7 @@ def _mark_jump(guard: Crossing) -> Crossing:
     `_from_below` takes for zero in a guard that falls."""
     x, eps = stop_gradient(guard.begin.x), float(jnp.finfo(guard.scale.dtype).eps)
     zero = eps**0.5 * guard.scale if guard.zero is None else guard.zero
-    return guard._replace(above=x > JUMPED * jnp.abs(x) + zero)
+    return guard._replace(above=x > jump_share(x) * jnp.abs(x) + zero)
 
 
 def at_stops(plan: Plan, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
@@ -580,7 +577,7 @@ def _landed(
     sudden, jumped = None, None
     if guard.above is not None:
         # A guard without a slope is followed further, to the clock's rounding.
-        jumped = stop_gradient(end.x) > JUMPED * guard.scale
+        jumped = stop_gradient(end.x) > jump_share(h) * guard.scale
         shortest = 4 * eps * (plan.unit + jnp.abs(stop_gradient(lane.s)))
         shortest = jnp.where(jumped, jnp.maximum(plan.in_units(_SUDDEN), shortest), shortest)
         # Near an equilibrium on its surface, a guard is rounding and may be zero anywhere.
@@ -598,8 +595,16 @@ def _landed(
 
 
 def tolerance_factor(plan: Plan, lane: Lane) -> Scalar:
-    """Return the factor of a lane's landing tolerance: its unit, and 1,000 after many attempts."""
-    return plan.in_units(jnp.where(lane.attempts >= _PATIENCE, 1e3, jnp.ones_like(lane.attempts)))
+    """Return the factor of a lane's landing tolerance: its unit, and `_patient` after many
+    attempts."""
+    one = jnp.ones_like(lane.attempts)
+    return plan.in_units(jnp.where(lane.attempts >= _PATIENCE, _patient(one), one))
+
+
+def _patient(x: Scalar) -> float:
+    """Return the factor of the landing tolerance after many attempts: in single precision 0.1 would
+    be another event."""
+    return 1e3 if x.dtype == jnp.float64 else 10.0
 
 
 def landing_tolerance(x: Scalar) -> float:
@@ -610,7 +615,13 @@ def landing_tolerance(x: Scalar) -> float:
 
 def furthest_landing(x: Scalar) -> float:
     """Return the largest trusted |δ|: near grazing, or after many attempts."""
-    return max(turn_tolerance(x), 1e3 * landing_tolerance(x))
+    return max(turn_tolerance(x), _patient(x) * landing_tolerance(x))
+
+
+def jump_share(x: Scalar) -> float:
+    """Return the share of its size above which a guard has jumped: rounding leaves less at an
+    event. The first is a choice; in single precision it is the rounding of a guard."""
+    return max(1e-9, 64 * float(jnp.finfo(x.dtype).eps))
 
 
 def turn_tolerance(x: Scalar) -> float:
