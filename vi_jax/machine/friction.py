@@ -429,7 +429,7 @@ def settled_modes(
         begins = tuple(released.get(i, none) for i in frictions_in(machine))
     slip_of, solve = (cast(Any, x) for x in (_slips, _settled))
     given = slip_of(machine, s, state, modes, begins)
-    return solve(machine, s, state, modes, contact, *given, contact)[0]
+    return solve(machine, s, state, modes, contact, *given, contact, None)[0]
 
 
 def pressed_contacts(
@@ -470,7 +470,7 @@ def _slips(
 @eqx.filter_jit
 def _settled(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
-    slips: Scalars, holds: Scalars, opened: Scalars, touching: tuple[Flag, ...] | None = None,
+    slips: Scalars, holds: Scalars, opened: Scalars, touching: tuple[Flag, ...] | None,
 ) -> tuple[Scalars, Scalars]:  # fmt: skip
     """Return the modes with those of all frictions, by their slips, and the contacts that stay
     closed, spare ones with a minus (see `Lane.contact`); jitted like `_solve_forces`."""
