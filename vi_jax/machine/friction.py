@@ -416,8 +416,17 @@ def settled_modes(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
     released: dict[int, Flag] | None = None,
 ) -> Scalars:  # fmt: skip
-    """Return the modes with those of all frictions after a jump, or after events of frictions. Each
-    body without slip sticks, or begins to slip; NaN if no motion fulfils the laws of friction.
+    """Return the modes of `settled_contacts`."""
+    return settled_contacts(machine, s, state, modes, contact, released)[0]
+
+
+def settled_contacts(
+    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
+    released: dict[int, Flag] | None = None,
+) -> tuple[Scalars, Scalars]:  # fmt: skip
+    """Return the modes with those of all frictions after a jump, or after events of frictions, and
+    the contacts as `pressed_contacts` does. Each body without slip sticks, or begins to slip; NaN
+    if no motion fulfils the laws of friction.
 
     **Arguments:** `modes`, for a friction with slip its direction; `contact`, as in `EventContext`;
     `released`, after events of frictions: for each friction whether its force has just become too
@@ -429,7 +438,7 @@ def settled_modes(
         begins = tuple(released.get(i, none) for i in frictions_in(machine))
     slip_of, solve = (cast(Any, x) for x in (_slips, _settled))
     given = slip_of(machine, s, state, modes, begins)
-    return solve(machine, s, state, modes, contact, *given, contact, None)[0]
+    return solve(machine, s, state, modes, contact, *given, contact, None)
 
 
 def pressed_contacts(
