@@ -46,7 +46,9 @@ def _impulses(
     alone = np.broadcast_to((1 + 1e-13) * np.eye(2 * n), (len(mu), len(modes), 2 * n, 2 * n)).copy()
     i = np.arange(n)
     alone[:, :, n + i, i] = slip * mu[:, None]  # a force against the slip
-    matrix = np.where(held[..., None], gains[:, None] + 1e-13 * np.diag(1.0 + np.arange(2 * n)), alone)
+    matrix = np.where(
+        held[..., None], gains[:, None] + 1e-13 * np.diag(1.0 + np.arange(2 * n)), alone
+    )
     right = np.where(held, -free[:, None], 0.0)
     force = np.linalg.solve(matrix, right[..., None])[..., 0]
     rate = force @ gains + free[:, None]

@@ -324,3 +324,33 @@ def test_corners_of_a_sliding_block_that_strike_in_turn_come_to_rest():
     speeds = speeds[speeds > 1e-6]
     np.testing.assert_allclose(speeds[1:] / speeds[:-1], share, rtol=2e-3)
     np.testing.assert_allclose(speeds[-1] / speeds[0], share ** (len(speeds) - 1), rtol=2e-2)
+
+
+class InACorner(vi.Mechanical):
+    """A body on a floor that is pushed on a wall, whose friction holds it, too."""
+
+    q = ("x", "y")
+    mass = (1.0, 1.0)
+    cycle = 1.0
+    mu: Any = 0.5
+    contacts = property(
+        lambda self: (
+            vi.RigidStop(0.0, 0.5, "left", on="x", friction=self.mu, along="y"),
+            vi.RigidStop(0.0, 0.5, "left", on="y"),
+        )
+    )
+
+    def force(self, t, q, v):
+        return dict(x=-5.0, y=1.0 - 4 * t)
+
+
+def test_a_floor_takes_over_when_the_friction_of_a_wall_is_at_its_bound():
+    """The friction holds the body alone until the force exceeds 5 μ. The body fell through the
+    floor, since the solver was asked once more at the bound, without the event."""
+    machine = InACorner()
+    run = vi.simulate(machine, machine.at(), 1, event_log=6)
+    assert run.successful
+    np.testing.assert_allclose([run.last.x, run.last.y, run.last.v.y], 0.0, atol=1e-15)
+    stops = [x.normal for x in vi.contact_forces(machine, run.last, 1.0).values()]
+    np.testing.assert_allclose(stops[0], 5.0, rtol=1e-12)
+    assert stops[1] >= 0.5 - 1e-12
