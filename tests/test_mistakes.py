@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import warnings
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -142,7 +142,23 @@ class Clocked(HalfPeriod):
 
 
 class Method(Free):
-    velocity: float = 1.0
+    velocity: Any
+
+
+def number_as_method():
+    class Decay(Free):
+        relaxation = 1.0
+
+
+def number_as_units():
+    class Dimensionless(Free):
+        units: float = 1.0
+
+
+def own_private_method():
+    class Sorted(Free):
+        def _stops(self):
+            return ()
 
 
 class NoReturn(Machine):
@@ -454,7 +470,13 @@ class Spare(Machine):
         (lambda: simulate(RowOfForces()), "its rate of v.x has shape (1,), not ()"),
         (lambda: simulate(Driving()), "must not be negative, but is -0.981 at the start"),
         (lambda: simulate(PushedPosition()), "must be the name of a velocity"),
-        (lambda: simulate(Method()), "'velocity' of a Method must have another name"),
+        (lambda: Method(1.0), "'velocity' of a Method must have another name"),
+        (number_as_method, "'relaxation' of a Decay must have another name, since it is a method"),
+        (
+            number_as_units,
+            "'units' of a Dimensionless must have another name, since it is a member",
+        ),
+        (own_private_method, "'_stops' of a Sorted must have another name"),
         (continue_clocked, "must not have cycles that end at a given time"),
         (kick_another, "an orbit of this machine, but its stops.0.gap is 2, not 2.1"),
         (lambda: NoCycle(), "must have `cycle`, but `NoCycle` has none: write `cycle: float"),

@@ -437,3 +437,44 @@ def test_missing_masses_and_forces_raise():
 
     with pytest.raises(TypeError, match="A Massless must have `mass`: one for each"):
         vi.simulate(Massless(), Massless().at(), 1)
+
+
+def test_parameters_may_have_natural_names():
+    """Names that the package uses itself are private, or refused (`test_mistakes`)."""
+    names = (
+        "places masses length mass gap speed radius load period time energy momentum state mode "
+        "free_names q_names q_shapes width height stiffness damping gravity amplitude frequency "
+        "phase restitution friction offset stroke torque power clearance clock section parts"
+    ).split()
+
+    def force(self, t, q, v):
+        return dict(x=sum(getattr(self, name) for name in names) - 40 * q.x)
+
+    kind = type("Natural", (vi.Mechanical,), {
+        "__annotations__": dict.fromkeys(names, float), "__module__": __name__, "q": ("x",),
+        "cycle": 1.0, "force": force, "contacts": vi.RigidStop(0.1, 0.5, on="x"),
+        **{name: 1.0 for name in names},
+    })  # fmt: skip
+    machine = kind()
+
+    class Plain(vi.Mechanical):
+        q = ("x",)
+        mass = 1.0
+        cycle = 1.0
+        contacts = vi.RigidStop(0.1, 0.5, on="x")
+
+        def force(self, t, q, v):
+            return dict(x=len(names) - 40 * q.x)
+
+    ends = [vi.simulate(x, x.at(), 1).last for x in (machine, Plain())]
+    np.testing.assert_allclose(ends[0].x, ends[1].x, rtol=1e-13)
+    np.testing.assert_allclose(ends[0].v.x, ends[1].v.x, rtol=1e-13)
+
+    class Helpers(Plain):
+        def places(self, count):
+            return [0.1 * i for i in range(count)]
+
+        def masses(self):
+            return [1.0]
+
+    assert vi.simulate(Helpers(), Helpers().at(), 1).last.x == ends[1].x

@@ -301,3 +301,56 @@ def test_a_corner_that_another_impact_lifts_is_released():
     for corner in (0, 1):
         of_corner = kinds[held & (numbers == corner)]
         assert len(of_corner) >= 7 and (np.diff(of_corner) != 0).all()  # rests and releases in turn
+
+
+def test_corners_of_a_sliding_block_that_strike_in_turn_come_to_rest():
+    """A tall block slides on one corner while the other hops. Each landing closes the first corner,
+    too. Let p_ij be the change of the speed of corner i by an impulse on corner j with its
+    friction. With restitution e the hopping corner leaves with e - p₀₁p₁₀(1 + e)/(p₀₀p₁₁) of
+    its speed. With the motion of first order within the brief chatter of the other corner it
+    gained speed, and went on for ever."""
+    a, h, mu, e, speed = 0.26, 0.44, 0.54, 0.7, 1e-5
+    block = Block(half_width=a, half_height=h, mu=mu, restitution=e, weight=6.2, cycle=0.5)
+    inertia = (a * a + h * h) / 3
+    p = [[1 + i * a * (j * a - mu * h) / inertia for j in (-1, 1)] for i in (-1, 1)]
+    share = e - p[0][1] * p[1][0] * (1 + e) / (p[0][0] * p[1][1])
+    start = block.at(y=h, v=dict(x=1.0, y=0.5 * speed, tilt=-0.5 * speed / a))
+    run = vi.simulate(block, start, 1, max_impacts=5000, impact_log=4000)
+    assert run.successful
+    # At the end only friction acts, until the block sticks.
+    np.testing.assert_allclose(run.last.x, 0.5 / (mu * 6.2), rtol=1e-4)
+    np.testing.assert_allclose([run.last.y, run.last.tilt], [h, 0.0], atol=1e-14)
+    speeds = np.asarray(run.impact_log.speed[0])[np.asarray(run.impact_log.stop[0]) == 0]
+    speeds = speeds[speeds > 1e-6]
+    np.testing.assert_allclose(speeds[1:] / speeds[:-1], share, rtol=2e-3)
+    np.testing.assert_allclose(speeds[-1] / speeds[0], share ** (len(speeds) - 1), rtol=2e-2)
+
+
+class InACorner(vi.Mechanical):
+    """A body on a floor that is pushed on a wall, whose friction holds it, too."""
+
+    q = ("x", "y")
+    mass = (1.0, 1.0)
+    cycle = 1.0
+    mu: Any = 0.5
+    contacts = property(
+        lambda self: (
+            vi.RigidStop(0.0, 0.5, "left", on="x", friction=self.mu, along="y"),
+            vi.RigidStop(0.0, 0.5, "left", on="y"),
+        )
+    )
+
+    def force(self, t, q, v):
+        return dict(x=-5.0, y=1.0 - 4 * t)
+
+
+def test_a_floor_takes_over_when_the_friction_of_a_wall_is_at_its_bound():
+    """The friction holds the body alone until the force exceeds 5 μ. The body fell through the
+    floor, since the solver was asked once more at the bound, without the event."""
+    machine = InACorner()
+    run = vi.simulate(machine, machine.at(), 1, event_log=6)
+    assert run.successful
+    np.testing.assert_allclose([run.last.x, run.last.y, run.last.v.y], 0.0, atol=1e-15)
+    stops = [x.normal for x in vi.contact_forces(machine, run.last, 1.0).values()]
+    np.testing.assert_allclose(stops[0], 5.0, rtol=1e-12)
+    assert stops[1] >= 0.5 - 1e-12

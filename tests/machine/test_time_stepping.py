@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from moreau import moreau
+from event_by_event import followed
+from moreau import impacts, moreau, rows_of
 from planar import Block
 
 END, HARMONICS = 0.5, np.arange(1, 6)
@@ -47,22 +48,62 @@ def simulated(kind, given, q, v):
 
 
 def compared(kind, given, gaps, places, mass, mu, q, v, weights):
-    """Return errors of positions at the end, and those that refinement of the reference shows."""
+    """Return the greatest difference in the positions at the end between each lane and a reference.
+
+    Lanes with a restitution of 1, in which nothing comes to rest, are followed from event to event,
+    the others by time stepping, whose steps are halved for lanes that differ by more than 1e-4, 7
+    times at most. `gaps` and `places` are functions of the coordinates and `given`, `weights` one
+    of two accelerations and `given`.
+
+    Differences of 1e-3 to 8e-2 were those of the reference. It let impacts gain energy, of which
+    the package has the share θ that gains none (8 of 120 blocks). Two corners strike within 1e-5,
+    and steps of 3e-5 change their order (3 blocks). With restitution 1 no steps were short enough:
+    three stacks that differed from 64,000 steps by 4e-4 to 2e-3 agree with SciPy to 6e-10.
+    """
     found, good = simulated(kind, given, q, v)
-    sizes, phases = given["sizes"], given["phases"]
-
-    def force(t, q, v):
-        pulls = [-floor(t, sizes[:, i], phases[:, i], np) for i in range(2)]
-        return weights(pulls[0], pulls[1] - 9.81)
-
     restitution = np.repeat(given["restitution"][:, None], mu.shape[1], 1)
-    ends = [
-        moreau(gaps, places, mass, force, mu, restitution, q, v, END, steps)[0]
-        for steps in (4_000, 8_000)
+    given = {**given, "mass": mass, "mu": mu, "restitution": restitution}
+    error = np.full(len(q), np.inf)
+
+    def force(t, q, v, given):
+        x, y = (-floor(t, given["sizes"][:, i], given["phases"][:, i], np) for i in range(2))
+        return weights(x, y - 9.81, given)
+
+    def lane_of(i):
+        return {name: x[i] for name, x in given.items()}
+
+    for i in np.flatnonzero(restitution[:, 0] == 1):
+        here = slice(i, i + 1)
+        end = by_events(gaps, places, force, lane_of(here), q[here], v[here])
+        error[i] = np.abs(found[i] - end).max()
+    left = np.flatnonzero(restitution[:, 0] < 1)
+    for steps in 2_000 * 2 ** np.arange(8):
+        end = moreau(gaps, places, force, lane_of(left), q[left], v[left], END, steps)[0]
+        error[left] = np.abs(found[left] - end).max(1)
+        left = left[~(error[left] <= 1e-4)]
+        if not left.size:
+            break
+    return error, good
+
+
+def by_events(gaps, places, force, given, q, v):
+    """Return the positions at the end of one lane by SciPy, if no contact stays closed."""
+    n = q.shape[1]
+
+    def rate(t, x):
+        pull = force(t, x[None, :n], x[None, n:], given)
+        return np.concatenate([x[n:], (pull / given["mass"])[0]])
+
+    def after(t, x):
+        q, v = x[None, :n], x[None, n:]
+        gap, rows, gains = rows_of(gaps, places, given, q)
+        return np.concatenate([x[:n], impacts(rows, gains, v, gap < 1e-10, given)[0][0]])
+
+    events = [
+        (lambda t, x, k=k: -gaps(x[None, :n], given)[k][0], after)
+        for k in range(given["mu"].shape[1])
     ]
-    # The error is of first order in the step.
-    refined = 2 * ends[1] - ends[0]
-    return np.abs(found - refined).max(1), np.abs(ends[1] - ends[0]).max(1), good
+    return followed(rate, np.concatenate([q[0], v[0]]), END, events, max_step=2e-3)[1][:n]
 
 
 def shaking(rng, lanes, along, up):
@@ -75,10 +116,10 @@ def random_blocks(rng, lanes):
     sizes, phases = shaking(rng, lanes, 8.0, 5.0)
     a, h = rng.uniform(0.1, 0.4, lanes), rng.uniform(0.1, 0.5, lanes)
     h[::4] = 0.0  # rods
-    mu, e = rng.uniform(0, 1, lanes), rng.choice([0.0, 0.3, 0.7], lanes)
+    mu, e = rng.uniform(0, 1, lanes), rng.choice([0.0, 0.3, 0.7, 1.0], lanes)
     given = dict(half_width=a, half_height=h, mu=mu, restitution=e, sizes=sizes, phases=phases)
     tilt = np.where(np.arange(lanes) % 3 > 0, rng.uniform(-0.3, 0.3, lanes), 0.0)
-    drop = np.where(np.arange(lanes) % 2 > 0, rng.uniform(0, 0.1, lanes), 0.0)
+    drop = np.where((np.arange(lanes) % 2 > 0) | (e == 1), rng.uniform(0, 0.1, lanes), 0.0)
     high = a * np.abs(np.sin(tilt)) + h * np.cos(tilt) + drop
     q = np.stack([np.zeros(lanes), high, tilt], 1)
     v = np.stack([rng.uniform(-1, 1, lanes), np.zeros(lanes), np.zeros(lanes)], 1)
@@ -92,21 +133,19 @@ def test_random_blocks_on_a_shaken_floor():
     given, q, v = random_blocks(np.random.default_rng(1), lanes)
     a, h, mu = given["half_width"], given["half_height"], np.repeat(given["mu"][:, None], 2, 1)
 
-    def gaps(q):
+    def gaps(q, given):
+        a, h = given["half_width"], given["half_height"]
         return [q[:, 1] + b * a * np.sin(q[:, 2]) - h * np.cos(q[:, 2]) for b in (-1, 1)]
 
-    def places(q):
+    def places(q, given):
+        a, h = given["half_width"], given["half_height"]
         return [q[:, 0] + b * a * np.cos(q[:, 2]) + h * np.sin(q[:, 2]) for b in (-1, 1)]
 
     mass = np.stack([np.ones(lanes), np.ones(lanes), (a * a + h * h) / 3], 1)
-    pull = lambda x, y: np.stack([x, y, 0 * x], 1)
-    error, refined, good = compared(ShakenBlock, given, gaps, places, mass, mu, q, v, pull)
-    # Impacts of two corners in turn may converge to rest so slowly that a lane is given up.
-    assert good.sum() >= lanes - 1
-    # The reference is not exact: halving its step changes some of its motions by up to 2e-3, not in
-    # proportion to the step, since the steps of the impacts change too.
-    assert (error[good] < 5 * refined[good] + 1e-4).all()
-    assert np.median(error[good]) < 5e-5
+    pull = lambda x, y, given: np.stack([x, y, 0 * x], 1)
+    error, good = compared(ShakenBlock, given, gaps, places, mass, mu, q, v, pull)
+    assert good.all()
+    assert (error < np.where(given["restitution"] == 1, 1e-7, 1e-4)).all(), error
 
 
 @pytest.mark.slow
@@ -160,16 +199,18 @@ def test_random_stacks_on_a_shaken_floor():
     lanes, rng = 40, np.random.default_rng(5)
     sizes, phases = shaking(rng, lanes, 8.0, 12.0)
     mass_2, mu = rng.uniform(0.3, 3.0, lanes), rng.uniform(0, 1, (lanes, 2))
-    e = rng.choice([0.0, 0.3, 0.7], lanes)
+    e = rng.choice([0.0, 0.3, 0.7, 1.0], lanes)
     given = dict(mass_2=mass_2, mu=mu, restitution=e, sizes=sizes, phases=phases)
-    zero, drop = np.zeros(lanes), rng.uniform(0, 0.05, (lanes, 2)) * rng.integers(0, 2, (lanes, 2))
+    falls = (rng.integers(0, 2, (lanes, 2)) > 0) | (e == 1)[:, None]
+    zero, drop = np.zeros(lanes), rng.uniform(0, 0.05, (lanes, 2)) * falls
     q = np.stack([zero, drop[:, 0], zero, drop.sum(1)], 1)
     v = np.stack([rng.uniform(-1, 1, lanes), zero, rng.uniform(-1, 1, lanes), zero], 1)
     one = np.ones(lanes)
     mass = np.stack([one, one, mass_2, mass_2], 1)
-    gaps = lambda q: [q[:, 1], q[:, 3] - q[:, 1]]
-    places = lambda q: [q[:, 0], q[:, 2] - q[:, 0]]
-    pull = lambda x, y: np.stack([x, y, mass_2 * x, mass_2 * y], 1)
-    error, refined, good = compared(Stack, given, gaps, places, mass, mu, q, v, pull)
+    gaps = lambda q, given: [q[:, 1], q[:, 3] - q[:, 1]]
+    places = lambda q, given: [q[:, 0], q[:, 2] - q[:, 0]]
+    heavy = lambda x, given: given["mass_2"] * x
+    pull = lambda x, y, given: np.stack([x, y, heavy(x, given), heavy(y, given)], 1)
+    error, good = compared(Stack, given, gaps, places, mass, mu, q, v, pull)
     assert good.all()
-    assert (error < 5 * refined + 1e-4).all() and np.median(error) < 5e-5
+    assert (error < np.where(given["restitution"] == 1, 1e-7, 1e-4)).all(), error

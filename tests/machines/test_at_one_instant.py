@@ -229,3 +229,34 @@ def test_impacts_coupled_by_friction():
         machine = type("Corner", (Chain,), {"contacts": walls})(0.5, (1.0, 1.0), length=3.0)
         v = vi.simulate(machine, machine.balls((0, 0), (1, 2)), 1).last.v
         np.testing.assert_allclose((v.a, v.b), (-0.05, -0.955), atol=1e-12)
+
+
+class PushedOn(vi.Mechanical):
+    """A body without a force of its own between a wall and another one that pushes it."""
+
+    q = ("a", "b")
+    mass = (1.0, 2.0)
+    cycle = 1.0
+    growth: float = 0.0
+    contacts = (
+        vi.RigidStop(1.0, 0.5, on="a"),
+        vi.RigidStop(0.0, 0.5, on=lambda q: q.b - q.a),
+    )
+
+    def force(self, t, q, v):
+        return dict(a=-self.growth * t, b=1.0 - 3 * jnp.maximum(t - 0.5, 0.0))
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.2, -0.2])
+def test_a_body_that_another_one_presses_on_a_wall_rests_there_from_the_start(growth):
+    """No force acts on it alone at the start, and it would move away if its own force grew."""
+    machine = PushedOn(growth)
+    run = vi.simulate(machine, machine.at(a=1.0, b=1.0), 1, event_log=6)
+    kinds, numbers = (np.asarray(x[0]) for x in (run.event_log.kind, run.event_log.number))
+    met = [(vi.EVENTS[k], n) for k, n in zip(kinds, numbers, strict=True) if k >= 0]
+    if growth > 0:  # the wall's force 1 - 3 (t - 1/2) - t/5 vanishes first
+        assert met[0] == ("release", 0)
+        np.testing.assert_allclose(run.event_log.phase[0, 0], 2.5 / 3.2, rtol=1e-12)
+    else:
+        assert met == [("release", 1)]
+        np.testing.assert_allclose(run.event_log.phase[0, 0], 0.5 + 1 / 3, rtol=1e-12)

@@ -355,7 +355,7 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
     `TypeError` for an invalid state of this machine."""
     check_reals(argument, state)
     if isinstance(machine, Mechanical):
-        q = machine.q_shapes
+        q = machine._q_shapes
         wanted = q | {f"v.{name}": shape for name, shape in q.items()}
         given = {part: jnp.shape(x) for part, x in named_leaves(state)}
         if not isinstance(state, NamedState) or given != wanted:
@@ -417,7 +417,7 @@ def check_prescribed(machine: AbstractMachine, start: State) -> None:
     if type(machine).prescribed is Mechanical.prescribed:
         return
     times = 0.0, INNER_INSTANT * machine.cycle
-    given, later = (components(machine.with_prescribed(t, start)) for t in times)
+    given, later = (components(machine._with_prescribed(t, start)) for t in times)
     for name, x in components(start).items():
         number, wanted, other = concrete(x), concrete(given[name]), concrete(later[name])
         if number is None or wanted is None or other is None:

@@ -49,7 +49,7 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     contact = None
     if plan.rests:
         jerks = [force_rate(free, x, free, s, start) for x in machine.coordinates]
-        contact = _contacts_at(plan, start, current, jerks)
+        contact, touching = _contacts_at(plan, start, current, jerks)
         direction = tuple(
             jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), sign)
             for x, j, sign in zip(current, jerks, direction, strict=True)
@@ -59,10 +59,10 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
             on_stop = machine.coordinates[stop.coordinate].placed(start, stop.place, zero)
             rests = contact[stop.coordinate] == to_event(i)
             start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), on_stop, start)
+        if is_compound(machine):
+            contact = pressed_contacts(machine, s, start, modes, contact, touching=touching)[1]
         if has_contact_friction(machine) or (stops_of(machine) and holds_anywhere(machine)):
             modes = struck_modes(machine, s, start, modes, contact=contact)
-        if is_compound(machine):
-            contact = pressed_contacts(machine, s, start, modes, contact)[1]
     slides = any(x.blends for x in switches_of(machine))
     if slides or holds_anywhere(machine) or has_contact_friction(machine):
         start = on_held_surfaces(machine, s, start, modes, contact or ())
@@ -94,12 +94,16 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     )
 
 
-def _contacts_at(plan: Plan, start: State, current: list[Rates], jerks: list[Scalar]) -> Scalars:
+def _contacts_at(
+    plan: Plan, start: State, current: list[Rates], jerks: list[Scalar]
+) -> tuple[Scalars, tuple[Flag, ...]]:
     """Return the stops on which the coordinates rest, by their rates and those of the forces: they
     are pressed on, or about to be by a force that grows. Of several contacts, `pressed_contacts`
-    decides later. Positions and velocities are known to the rounding of a search that ends there.
+    decides later: return whether each touches its stop without a force of its own, but may be
+    pressed on by another body. Positions and velocities are known to the rounding of a search that
+    ends there.
     """
-    machine, found = plan.machine, []
+    machine, found, touching = plan.machine, [], []
     for k, (here, jerk) in enumerate(zip(current, jerks, strict=True)):
         eps = float(jnp.finfo(here.x.dtype).eps)
         (slack, slow), least = plan.rounding_bounds(k, start), 4 * eps * plan.extent(k)
@@ -107,11 +111,13 @@ def _contacts_at(plan: Plan, start: State, current: list[Rates], jerks: list[Sca
             # A resting body gathers the rounding of the force on it: a woodpecker 0.03 of this.
             slow = jnp.maximum(slow, 4 * eps * machine.cycle * jnp.abs(here.a))
         slack, slow = jnp.maximum(slack, least), jnp.maximum(slow, least / plan.unit)
-        rests = {}
+        rests, pressed = {}, jnp.zeros((), bool)
         for i in stops_on(machine, k):
             stop = stops_of(machine)[i]
-            pushes = here.a != 0 if is_compound(machine) else stop.sign * here.a > 0
-            pressed = pushes | (here.a == 0) & (stop.sign * jerk > 0)
-            rests[i] = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slow) & pressed
+            here_pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * jerk > 0)
+            rests[i] = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slow)
+            pressed = pressed | rests[i] & here_pressed
+            rests[i] = rests[i] & (here_pressed | is_compound(machine))
         found.append(chosen_stop(machine, k, rests, jnp.zeros_like(here.x)))
-    return tuple(found)
+        touching.append((here.a == 0) & ~pressed)
+    return tuple(found), tuple(touching)

@@ -481,7 +481,7 @@ def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -
     modes, cycle = _modes_near(machine, zero, start), zero + machine.cycle
     later = np.arange(1, 5) + INNER_INSTANT
     instants = zero + cycle * np.array([0.0, INNER_INSTANT, 1.0, *later])
-    prescribed = getattr(machine, "with_prescribed", lambda s, state: state)
+    prescribed = getattr(machine, "_with_prescribed", lambda s, state: state)
 
     def rates(s: Scalar) -> tuple[State, State, State]:
         state = prescribed(s, start)
@@ -530,12 +530,12 @@ def _masses(machine: AbstractMachine, start: State) -> Any:
     """Return the mass matrix at the start; an empty array if the machine has none."""
     if not isinstance(machine, Mechanical):
         return np.zeros(0)
-    places = machine.places(start)
-    found = _masses_at(machine, places) if callable(machine.mass) else machine.masses(places)
-    return np.zeros(0) if any(machine.q_shapes.values()) else np.array(found, float)
+    places = machine._places(start)
+    found = _masses_at(machine, places) if callable(machine.mass) else machine._masses(places)
+    return np.zeros(0) if any(machine._q_shapes.values()) else np.array(found, float)
 
 
-_masses_at = eqx.filter_jit(lambda machine, q: machine.masses(q))
+_masses_at = eqx.filter_jit(lambda machine, q: machine._masses(q))
 
 
 def _states_around(zero: Scalar, cycle: Scalar, start: State, modes: Scalars) -> Any:
@@ -636,7 +636,7 @@ def check_parts(machine: AbstractMachine) -> None:
 
 def _check_gap(machine: Mechanical, gap: Callable[..., Any]) -> None:
     label = f"The gap `on` of a contact of a {type(machine).__name__}"
-    places = NamedState(**{name: np.zeros(shape) for name, shape in machine.q_shapes.items()})
+    places = NamedState(**{name: np.zeros(shape) for name, shape in machine._q_shapes.items()})
     try:
         with explain_errors(label):
             jax.eval_shape(gap, places)
@@ -655,17 +655,11 @@ def _check_ignored(what: str, parts: Sequence[Any], name: str) -> None:
 
 
 def _check_names(machine: AbstractMachine) -> None:
-    """**Raises:** `TypeError` for a field with the name of a method, `ValueError` for an invalid
-    coordinate, a stop on an angle of `wrap_angles`, or with an invalid `on`."""
-    kind, base = type(machine), Mechanical if isinstance(machine, Mechanical) else AbstractMachine
-    for field in dataclasses.fields(machine):
-        is_method = callable(getattr(base, field.name, None))
-        if is_method and not callable(getattr(machine, field.name)):
-            raise TypeError(
-                f"Field {field.name!r} of a {kind.__name__} must have another name, since it is a "
-                "method of every machine."
-            )
-    if any("section" in vars(x) for x in kind.__mro__ if not is_builtin(x)):
+    """**Raises:** `ValueError` for an invalid coordinate, a stop on an angle of `wrap_angles`, or
+    with an invalid `on`."""
+    kind = type(machine)
+    own = [vars(x).get("section") for x in kind.__mro__ if not is_builtin(x)]
+    if any(map(callable, own)):  # a number is a parameter
         _warn_once(
             kind,
             f"The `section` of a {kind.__name__} has no effect. Cycles end by `cycle`: a number, "

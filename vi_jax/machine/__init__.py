@@ -34,7 +34,8 @@ from .events import (
     holds_anywhere, is_autonomous, is_compound, jump_of, section_number, sides_of, struck_modes,
 )
 from .friction import (
-    ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_modes, shared_loads,
+    ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_contacts, settled_modes,
+    shared_loads,
 )
 from .leaves import (
     by_name, check_again, check_leaf, check_name, components, first_few, in_rows, leaf, leaf_names,

@@ -6,14 +6,17 @@ the other events, and by index the coordinates that stops limit.
 """
 
 import abc
+import dataclasses
 from collections.abc import Callable, Mapping
 from functools import partial, wraps
 from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
 try:
     from jax.extend.core import get_opaque_trace_state
@@ -28,7 +31,14 @@ from .event import AbstractEvent, AbstractSwitch, Section
 from .events import Reset
 from .friction import ContactFriction, DryFriction, joined
 from .leaves import components
-from .overrides import defines, derived, overridden, with_own_defaults, with_static
+from .overrides import (
+    defines,
+    derived,
+    is_builtin,
+    overridden,
+    with_own_defaults,
+    with_static,
+)
 from .parts import stops_of, switches_of
 from .printing import Shown
 from .stop import RigidStop, SoftStop, Wall
@@ -40,6 +50,28 @@ _REQUIRED = {
     "field": "write `def field(self, s, state)`, which returns the rate of each part of the state",
     "force": "write `def force(self, t, q, v)`, which returns the force on each coordinate by name",
 }
+
+
+# Members of every machine that are neither methods nor numbers.
+_NO_NUMBERS = ("labels", "units", "coordinates")
+
+
+def _refuse_taken_names(kind: type, members: Mapping[str, Any]) -> None:
+    """**Raises:** `TypeError` if a parameter of a user's machine has the name of a method, or a
+    number that of another member of every machine."""
+    base: Any = next(x for x in kind.__mro__ if is_builtin(x))
+    for name, x in members.items():
+        x = getattr(x, "default", x) if isinstance(x, dataclasses.Field) else x
+        is_known = x is not dataclasses.MISSING and not hasattr(x, "__get__")
+        is_method = callable(getattr(base, name, None)) and name not in base.__dataclass_fields__
+        is_number = isinstance(x, int | float | jax.Array | np.ndarray | np.number)
+        is_taken = (is_method and not callable(x)) or (name in _NO_NUMBERS and is_number)
+        is_private = name[0] == "_" and name[:4] != "_abc" and hasattr(base, name)
+        if name[:2] != "__" and ((is_known and is_taken) or is_private):
+            raise TypeError(
+                f"Field {name!r} of a {kind.__name__} must have another name, since it is a "
+                f"{'method' if is_method else 'member'} of every machine."
+            )
 
 
 def listed(parts: object) -> tuple[Any, ...]:
@@ -258,7 +290,13 @@ class AbstractMachine(Shown):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
+        if not is_builtin(cls):
+            _refuse_taken_names(cls, vars(cls))
         with_own_defaults(cls)
+
+    def __check_init__(self):
+        if not is_builtin(type(self)):
+            _refuse_taken_names(type(self), vars(self))
 
     def __new__(cls, *args: Any, **kwargs: Any):
         missing = {*cls.__abstractmethods__, *getattr(cls, "__abstractvars__", ())}

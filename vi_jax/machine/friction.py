@@ -416,8 +416,17 @@ def settled_modes(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
     released: dict[int, Flag] | None = None,
 ) -> Scalars:  # fmt: skip
-    """Return the modes with those of all frictions after a jump, or after events of frictions. Each
-    body without slip sticks, or begins to slip; NaN if no motion fulfils the laws of friction.
+    """Return the modes of `settled_contacts`."""
+    return settled_contacts(machine, s, state, modes, contact, released)[0]
+
+
+def settled_contacts(
+    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
+    released: dict[int, Flag] | None = None,
+) -> tuple[Scalars, Scalars]:  # fmt: skip
+    """Return the modes with those of all frictions after a jump, or after events of frictions, and
+    the contacts as `pressed_contacts` does. Each body without slip sticks, or begins to slip; NaN
+    if no motion fulfils the laws of friction.
 
     **Arguments:** `modes`, for a friction with slip its direction; `contact`, as in `EventContext`;
     `released`, after events of frictions: for each friction whether its force has just become too
@@ -429,22 +438,22 @@ def settled_modes(
         begins = tuple(released.get(i, none) for i in frictions_in(machine))
     slip_of, solve = (cast(Any, x) for x in (_slips, _settled))
     given = slip_of(machine, s, state, modes, begins)
-    return solve(machine, s, state, modes, contact, *given, contact)[0]
+    return solve(machine, s, state, modes, contact, *given, contact, None)
 
 
 def pressed_contacts(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
-    opened: Scalars | None = None,
+    opened: Scalars | None = None, touching: tuple[Flag, ...] | None = None,
 ) -> tuple[Scalars, Scalars]:  # fmt: skip
     """Return the modes, and the contacts (as in `EventContext`) without those that the forces of
-    this state open. Of those that are `opened`, the spare ones stay closed. Frictions that slip in
-    `modes` go on."""
+    this state open. Of those that are `opened`, the spare ones stay closed; of those that are only
+    `touching`, those that are pressed on. Frictions that slip in `modes` go on."""
     indices, switches, solve = frictions_in(machine), switches_of(machine), cast(Any, _settled)
     slips = tuple(jnp.where(jnp.abs(modes[i]) < 1, 0.0, modes[i]) for i in indices)
     ratios = (switches[i].static_share(machine, s, state) for i in indices)
     holds = tuple(ratio + jnp.zeros_like(s) for ratio in ratios)
     opened = contact if opened is None else opened
-    return solve(machine, s, state, modes, contact, slips, holds, opened)
+    return solve(machine, s, state, modes, contact, slips, holds, opened, touching)
 
 
 @eqx.filter_jit
@@ -470,7 +479,7 @@ def _slips(
 @eqx.filter_jit
 def _settled(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
-    slips: Scalars, holds: Scalars, opened: Scalars,
+    slips: Scalars, holds: Scalars, opened: Scalars, touching: tuple[Flag, ...] | None,
 ) -> tuple[Scalars, Scalars]:  # fmt: skip
     """Return the modes with those of all frictions, by their slips, and the contacts that stay
     closed, spare ones with a minus (see `Lane.contact`); jitted like `_solve_forces`."""
@@ -486,6 +495,8 @@ def _settled(
         new[i] = jnp.where(touches[n], mode, new[i])
     for row, k in enumerate(limited_in(machine) if contact else ()):
         stays = answer.kept[row] | answer.unsolved
+        if touching is not None:
+            stays = stays & (~touching[k] | (answer.force[row] > 0))
         kept[k] = jnp.where(stays, contact[k], 0.0)
         if len(kept) > 1:
             spare = answer.spare[row] & ~answer.unsolved

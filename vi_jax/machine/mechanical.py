@@ -75,14 +75,14 @@ class Mechanical(AbstractMachine):
     def at(self, v: Any = None, **places: Any) -> Any:
         """Return a state with these positions, and in `v` velocities, by name. Others are 0, or for
         prescribed coordinates those at t = 0."""
-        names, v = self.free_names, {} if v is None else v
+        names, v = self._free_names, {} if v is None else v
         if not isinstance(v, Mapping | Named):
             raise TypeError(
                 f"Argument `v` must be velocities by name, dict({names[0]}=...): {v!r}."
             )
         v = dict(vars(v) if isinstance(v, Named) else v)
         wrong = next((x for x in (*places, *v) if x not in names), None)
-        if wrong in self.q_names:
+        if wrong in self._q_names:
             raise ValueError(
                 f"The motion of {wrong!r} is prescribed by the machine. Leave it out: a state has "
                 f"free values of {', '.join(names)} alone."
@@ -92,14 +92,14 @@ class Mechanical(AbstractMachine):
                 f"{wrong!r} is not one of the coordinates {', '.join(names)}. Give velocities by "
                 f"name in `v`: `at({names[0]}=0.1, v=dict({names[0]}=1.0))`."
             )
-        zeros = {x: jnp.zeros(shape) if shape else 0.0 for x, shape in self.q_shapes.items()}
+        zeros = {x: jnp.zeros(shape) if shape else 0.0 for x, shape in self._q_shapes.items()}
         at, rate = zeros | places, zeros | v
         for name, zero in zeros.items():
-            if self.q_shapes[name]:  # one number holds for all
+            if self._q_shapes[name]:  # one number holds for all
                 at[name], rate[name] = zero + at[name], zero + rate[name]
-        return self.with_prescribed(0.0, Named(**at, v=Named(**rate)))
+        return self._with_prescribed(0.0, Named(**at, v=Named(**rate)))
 
-    def with_prescribed(self, t: Any, state: Any) -> Any:
+    def _with_prescribed(self, t: Any, state: Any) -> Any:
         """Return a state with the prescribed positions and velocities at a time."""
         if type(self).prescribed is Mechanical.prescribed:
             return state
@@ -112,12 +112,12 @@ class Mechanical(AbstractMachine):
         return self.at()
 
     @property
-    def q_names(self) -> tuple[str, ...]:
+    def _q_names(self) -> tuple[str, ...]:
         """The names of the coordinates."""
-        return tuple(self.q_shapes)
+        return tuple(self._q_shapes)
 
     @property
-    def q_shapes(self) -> dict[str, tuple[int, ...]]:
+    def _q_shapes(self) -> dict[str, tuple[int, ...]]:
         """The shapes of the coordinates, by name; `()` for one number."""
         if not hasattr(self, "q"):
             raise TypeError(
@@ -125,6 +125,11 @@ class Mechanical(AbstractMachine):
                 "names of its coordinates."
             )
         given = (self.q,) if isinstance(self.q, str) else self.q
+        if not isinstance(given, tuple | list):
+            raise TypeError(
+                f"`q` of a {type(self).__name__} must be the names of its coordinates, but is "
+                f"{given!r}. Give a parameter another name."
+            )
         shapes = dict(map(split_index, given))
         if len(shapes) < len(given) or "v" in shapes:
             raise ValueError(
@@ -134,27 +139,27 @@ class Mechanical(AbstractMachine):
         return shapes
 
     @property
-    def free_names(self) -> tuple[str, ...]:
+    def _free_names(self) -> tuple[str, ...]:
         """The names of the coordinates whose motion is not prescribed."""
         if type(self).prescribed is Mechanical.prescribed:
-            return self.q_names
+            return self._q_names
         given = jax.eval_shape(self.prescribed, 0.0)
         if not isinstance(given, Mapping):
             raise TypeError(
                 f"`prescribed` of a {type(self).__name__} must return positions by name, "
-                f"`dict({self.q_names[-1]}=...)`."
+                f"`dict({self._q_names[-1]}=...)`."
             )
-        unknown = [x for x in given if x not in self.q_names]
+        unknown = [x for x in given if x not in self._q_names]
         if unknown:
             raise ValueError(
                 f"`prescribed` of a {type(self).__name__} returned {unknown[0]!r}, which is not "
-                f"one of the coordinates {', '.join(self.q_names)}."
+                f"one of the coordinates {', '.join(self._q_names)}."
             )
-        return tuple(x for x in self.q_names if x not in given)
+        return tuple(x for x in self._q_names if x not in given)
 
     def field(self, t: Scalar, state: State, *modes: Scalar) -> Any:
         """Return the rate of the state: velocities, and accelerations by Lagrange's equations."""
-        q, v, names = self.places(state), state.v, self.free_names
+        q, v, names = self._places(state), state.v, self._free_names
         whose = f"`force` of a {type(self).__name__}"
         free = Named(**{name: getattr(v, name) for name in names})
         try:
@@ -170,10 +175,10 @@ class Mechanical(AbstractMachine):
         applied = vars(applied) | known
         both = zip(applied.values(), self._inertial(q, v), strict=True)
         net_forces = [_minus_product(f, 1.0, h) for f, h in both]
-        rates = dict(zip(names, solved(self.masses(q), net_forces), strict=True))
-        if len(names) < len(self.q_names):
+        rates = dict(zip(names, solved(self._masses(q), net_forces), strict=True))
+        if len(names) < len(self._q_names):
             rates |= self._prescribed_accelerations(t, q, v)
-        zero, v_rates = jax.tree.map(jnp.zeros_like, state), {x: rates[x] for x in self.q_names}
+        zero, v_rates = jax.tree.map(jnp.zeros_like, state), {x: rates[x] for x in self._q_names}
         return _in_state(zero, *self._by_s(t, state, v, Named(**v_rates)))
 
     def _by_s(self, s: Scalar, state: State, *rates: Named) -> Sequence[Named]:
@@ -204,11 +209,11 @@ class Mechanical(AbstractMachine):
             for name, acceleration in accelerations.items()
         }
 
-    def places(self, state: State) -> Named:
+    def _places(self, state: State) -> Named:
         """Return the coordinates in a state, without velocities."""
-        return Named(**{name: getattr(state, name) for name in self.q_names})
+        return Named(**{name: getattr(state, name) for name in self._q_names})
 
-    def masses(self, q: Named) -> Matrix:
+    def _masses(self, q: Named) -> Matrix:
         """Return the mass matrix at these coordinates, as rows of numbers."""
         given = _mass_of(self)
         if given is None:
@@ -216,18 +221,18 @@ class Mechanical(AbstractMachine):
                 f"A {type(self).__name__} must have `mass`: one for each of its coordinates, in "
                 "the class or by a method `mass(self, q)`."
             )
-        shapes = {name: self.q_shapes[name] for name in self.free_names}
+        shapes = {name: self._q_shapes[name] for name in self._free_names}
         return matrix_of(given(q) if callable(given) else given, shapes, type(self).__name__)
 
     def _inertial(self, q: Named, v: Named) -> list[Any]:
         """Return h = dM/dt v - ½ ∂(vᵀMv)/∂q of Lagrange's equations; 0 with constant masses."""
-        names = self.free_names
+        names = self._free_names
         if not callable(_mass_of(self)):
             return [0.0 for _ in names]
         speeds, found = [getattr(v, name) for name in names], dict.fromkeys(names, 0.0)
 
         def momenta(q: Named) -> list[Any]:
-            rows = (zip(row, speeds, strict=True) for row in self.masses(q))
+            rows = (zip(row, speeds, strict=True) for row in self._masses(q))
             return [_sum(_times(m, x) for m, x in row if not _is_zero(m)) for row in rows]
 
         def twice_energy(q: Named) -> Any:
@@ -273,19 +278,19 @@ def _mass_of(machine: Any) -> Any:
 def _coordinate_name(machine: Mechanical, on: Any) -> str | None:
     """Return the name of a coordinate, or `None` for a gap. Without stops, the first number of the
     first coordinate is the one of which extremes are recorded."""
-    name = machine.q_names[0] if on is None else on
+    name = machine._q_names[0] if on is None else on
     if on is None and not any(isinstance(x, Wall) for x in contacts_in(machine)):
-        name += str([0] * len(machine.q_shapes[name])) * bool(machine.q_shapes[name])
-    elif on is None and len(machine.q_names) > 1:
+        name += str([0] * len(machine._q_shapes[name])) * bool(machine._q_shapes[name])
+    elif on is None and len(machine._q_names) > 1:
         raise ValueError(
             f"Argument `on` of a contact of a {type(machine).__name__} must be given: "
-            f"`on={name!r}`, or another of the coordinates {', '.join(machine.q_names)}."
+            f"`on={name!r}`, or another of the coordinates {', '.join(machine._q_names)}."
         )
     if callable(name):
         return None
     base, index = split_index(name) if isinstance(name, str) else ("", ())
-    if len(machine.q_shapes.get(base, (0,))) != len(index):
-        names = [x + str([0] * len(shape)) * bool(shape) for x, shape in machine.q_shapes.items()]
+    if len(machine._q_shapes.get(base, (0,))) != len(index):
+        names = [x + str([0] * len(shape)) * bool(shape) for x, shape in machine._q_shapes.items()]
         raise ValueError(
             f"Argument `on` of a contact must be one of the coordinates {tuple(names)}, or a "
             f"function of them, but got {on!r}."
@@ -341,7 +346,7 @@ def _once(function: Callable[..., Any]) -> Callable[..., Any]:
 @_once
 def _position(machine: Mechanical, on: Any, state: State) -> Any:
     name = _coordinate_name(machine, on)
-    return on(machine.places(state)) if name is None else component(name, state)
+    return on(machine._places(state)) if name is None else component(name, state)
 
 
 @_once
@@ -349,12 +354,12 @@ def _velocity(machine: Mechanical, on: Any, state: State) -> Any:
     name, v = _coordinate_name(machine, on), state.v
     if name is not None:
         return component(name, v)
-    return jax.jvp(on, (machine.places(state),), (v,))[1]
+    return jax.jvp(on, (machine._places(state),), (v,))[1]
 
 
 def _gradient(machine: Mechanical, on: Any, q: Named) -> list[Any]:
     """Return J, the gradient of a gap; its constant entries are plain numbers."""
-    name, names = _coordinate_name(machine, on), machine.q_names
+    name, names = _coordinate_name(machine, on), machine._q_names
     if name is not None:
         base, index = split_index(name)
         one = jnp.zeros_like(getattr(q, base)).at[index].set(1.0) if index else 1.0
@@ -386,10 +391,10 @@ def _rate_along(function: Callable[[Named], Any], q: Named, name: str, speed: An
 def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any, list[Any]]:
     """Return M⁻¹Jᵀ/(J M⁻¹Jᵀ), the change of the velocities for a unit change of a gap's velocity;
     the effective mass 1/(J M⁻¹Jᵀ); and J."""
-    names, gradient = machine.free_names, _gradient(machine, on, q)
-    by_name = dict(zip(machine.q_names, gradient, strict=True))
+    names, gradient = machine._free_names, _gradient(machine, on, q)
+    by_name = dict(zip(machine._q_names, gradient, strict=True))
     slopes = [by_name[name] for name in names]
-    push = solved(machine.masses(q), slopes)
+    push = solved(machine._masses(q), slopes)
     gain = _dot(slopes, push)
     if _is_zero(gain):
         raise ValueError(
@@ -397,23 +402,23 @@ def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any, list[
             "Its gap must depend on a coordinate that is not prescribed."
         )
     pushes = {name: 0.0 if _is_zero(x) else x / gain for name, x in zip(names, push, strict=True)}
-    return [pushes.get(name, 0.0) for name in machine.q_names], 1 / gain, gradient
+    return [pushes.get(name, 0.0) for name in machine._q_names], 1 / gain, gradient
 
 
 def _effective_mass(machine: Mechanical, on: Any, s: Scalar, state: State) -> Any:
-    return _push(machine, on, machine.places(state))[1]
+    return _push(machine, on, machine._places(state))[1]
 
 
 def _row(machine: Mechanical, on: Any, state: State) -> Row:
     name = _coordinate_name(machine, on)
-    push, mass, slopes = _push(machine, on, machine.places(state))
-    push = dict(zip(machine.q_names, push, strict=True))
+    push, mass, slopes = _push(machine, on, machine._places(state))
+    push = dict(zip(machine._q_names, push, strict=True))
     if name in push:
         push[name] = 1.0
     zero = jax.tree.map(lambda x: np.zeros(jnp.shape(x), jnp.result_type(x)), state)
 
     def as_velocities(values: Iterable[Any]) -> Any:
-        both = zip(vars(machine.places(zero)).items(), values, strict=True)
+        both = zip(vars(machine._places(zero)).items(), values, strict=True)
         v = {x: (jnp if isinstance(value, jax.Array) else np).full_like(y, value)
              for (x, y), value in both}  # fmt: skip
         return zero.replace(v=Named(**v))
@@ -424,7 +429,7 @@ def _row(machine: Mechanical, on: Any, state: State) -> Row:
 def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Any:
     """Return the state with another position and velocity of a gap, by the least change in the norm
     of the masses. A coordinate by name is set exactly."""
-    name, q = _coordinate_name(machine, on), machine.places(state)
+    name, q = _coordinate_name(machine, on), machine._places(state)
     q = _moved(q, _push(machine, on, q)[0], Y - on(q)) if name is None else _replaced(q, name, Y)
     push, v = _push(machine, on, q)[0], state.v
     v = _moved(v, push, V - _velocity(machine, on, _in_state(state, q, v)))

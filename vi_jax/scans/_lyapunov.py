@@ -326,7 +326,7 @@ def _is_free(machine: AbstractMachine, start: State) -> np.ndarray:
     names = [name.removeprefix("v.").split("[")[0] for name in components(without_modes(start))]
     given = set()
     if isinstance(machine, Mechanical):
-        given = {*machine.q_names} - {*machine.free_names}
+        given = {*machine._q_names} - {*machine._free_names}
     return np.array([name not in given for name in names])
 
 

@@ -206,7 +206,7 @@ class ScanProgram(eqx.Module):
             machine = in_clock(machine, self.options.clock)
         start = machine.start() if self.start is None else self.start
         if isinstance(machine, Mechanical) and self.start is not None:  # another lane's, perhaps
-            start = replaced(start, machine.with_prescribed(0.0, without_modes(start)))
+            start = replaced(start, machine._with_prescribed(0.0, without_modes(start)))
         of_start = {name: x for name, x in values.items() if part_of(name) == START}
         start = replaced(start, start_with(without_modes(start), of_start))
         return machine, self._perturbed(start, START, perturbation)

@@ -25,7 +25,7 @@ from ...machine import (
     outcomes_of,
     pressed_contacts,
     section_number,
-    settled_modes,
+    settled_contacts,
     stops_of,
     stops_on,
     struck_modes,
@@ -163,12 +163,14 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
         if len(numbers) > 1:
             its_entry = select(here, its_entry, (kind, logged_number, value))
         (kind, logged_number, value), happens = its_entry, happens | here
+    settled = None
     if released:
-        modes, value = _after_friction(plan, lane._replace(state=new, modes=modes), released, value)
+        given = lane._replace(state=new, modes=modes)
+        modes, settled, value = _after_friction(plan, given, released, value)
     clock = plan.clock(lane.s, old)
     lane = lane.log_event(taken & happens, clock, kind, logged_number, value)
     lane = _update_after(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
-    lane = release_pulled(plan, lane, taken, happens, (old, modes_before))
+    lane = release_pulled(plan, lane, taken, happens, (old, modes_before), settled=settled)
     triggered, near, before = {}, x.near, (old, modes_before)
     if others_of(machine):
         lane, triggered, near = trigger_events(plan, lane, happens, before, chosen, near)
@@ -185,28 +187,30 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
 
 def _after_friction(
     plan: Plan, lane: Lane, events: dict[int, tuple[Flag, Flag]], value: Scalar | float
-) -> tuple[Scalars, Scalar]:
-    """Return the modes after an event of a friction, and the new mode for the log, if it happened;
-    else those of the lane and `value`. `events`: for each friction's mode, whether its force became
-    too large, and whether its event happened."""
+) -> tuple[Scalars, tuple[Flag, Scalars], Scalar]:
+    """Return the modes after an event of a friction, whether one happened and the contacts then,
+    and the new mode for the log; without one those of the lane and `value`. `events`: for each
+    friction's mode, whether its force became too large, and whether its event happened."""
     any_event = any_of(jnp.zeros((), bool), (here for _, here in events.values()))
     released = {i: when for i, (when, _) in events.items()}
 
-    def settled(modes: Scalars) -> Scalars:
-        contact = lane.contact or ()
+    contact = lane.contact or ()
+
+    def settled(modes: Scalars) -> tuple[Scalars, Scalars]:
         # A slip whose event happened is zero now, to the rounding of a surface's speed.
         given = {i: jnp.where(here, 0.0, modes[i]) for i, (_, here) in events.items()}
         modes = tuple(given.get(i, mode) for i, mode in enumerate(modes))
-        return constant_modes(
-            settled_modes(plan.machine, lane.s, lane.state, modes, contact, released), lane.s
-        )
+        given = plan.machine, lane.s, lane.state, modes, contact, released
+        modes, kept = settled_contacts(*given)
+        return constant_modes(modes, lane.s), kept
 
-    modes = jax.lax.cond(any_event, settled, lambda modes: modes, lane.modes)
+    old = lane.modes, tuple(jnp.abs(x) for x in contact)
+    modes, kept = jax.lax.cond(any_event, lambda: settled(lane.modes), lambda: old)
     found = jnp.asarray(value, lane.s.dtype)
     for i, (_, here) in events.items():
         held = jnp.where(jnp.abs(modes[i]) < 1, 0.0, modes[i])  # see `Friction`
         found = jnp.where(here, held, found)
-    return modes, found
+    return modes, (any_event, kept), found
 
 
 def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, here: Flag) -> Lane:
@@ -250,10 +254,13 @@ def _guard_jumped(
 def release_pulled(
     plan: Plan, lane: Lane, taken: Flag, when: Flag,
     before: tuple[State, Scalars], contact_before: Scalars | None = None,
+    settled: tuple[Flag, Scalars] | None = None,
 ) -> Lane:  # fmt: skip
     """Return the lane with those bodies free that were pressed on their stops before an event, and
-    are pulled away after it: a force that jumps does not pass through zero. `contact_before` is
-    given if contacts may have changed."""
+    are pulled away after it: a force that jumps does not pass through zero. **Arguments:**
+    `contact_before`, if contacts may have changed; `settled`, whether an event of a friction has
+    settled the contacts, and these. Asked anew without its event, frictions at their bounds would
+    hold a contact that is pressed on."""
     machine, contact, modes, s = plan.machine, lane.contact, lane.modes, lane.s
     if contact is None:
         return lane
@@ -264,6 +271,7 @@ def release_pulled(
     if together:
         closed = contact if contact_before is None else _with_touching(plan, lane, contact)
         kept = pressed_contacts(machine, s, lane.state, modes, contact, opened=closed)[1]
+        kept = kept if settled is None else select(settled[0], settled[1], kept)
     for k in limited_in(machine):
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:

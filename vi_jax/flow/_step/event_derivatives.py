@@ -193,6 +193,13 @@ class FlowToEvent:
         """Return s, state and integrals after a further `offset`, by default from the start."""
         return extrapolate(self._pure_rate, offset, *self._arguments(moving))
 
+    def midpoint_step(self, offset: Scalar) -> Any:
+        """Return the same for a longer `offset`, of second order."""
+        half, start = 0.5 * offset, self._moving
+        middle = self.extrapolate(half)
+        later = self.extrapolate(half, middle)
+        return jtu.tree_map(lambda x, y, z: x + 2 * (z - y), start, middle, later)
+
     def with_flow_derivatives(self, offset: Scalar) -> Any:
         """Return the same for an offset that is zero in value, but has derivatives."""
         return with_flow_derivatives(self._pure_rate, offset, *self._arguments())
