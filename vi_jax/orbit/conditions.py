@@ -215,16 +215,6 @@ def replacement_at(problem: Shooting, x: np.ndarray) -> Replacement | None:
     return Replacement(jnp.asarray(left[:, -1]), jnp.asarray(right[-1] * problem.scale[:-2]))
 
 
-class FixedComponent(AbstractCondition):
-    """The condition that the unknowns have a given component along a row."""
-
-    row: Float[Array, " unknowns"]
-    value: Scalar
-
-    def residual(self, problem, x, observed, begins):
-        return self.row @ x - self.value
-
-
 class Special(AbstractCondition):
     """The condition that a motion is special.
 
