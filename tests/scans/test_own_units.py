@@ -24,7 +24,7 @@ def assert_same_sweeps(kind, first=None):
         run = vi.sweep(machine, "p", values, start=machine.start(), settle=200, progress=False)
         found = run.period, np.where(run.period > 0, run.impacts, 0)
         first = found if first is None else first
-        case = f"{machine.scales} {machine.phase} {machine.is_flipped}"
+        case = str(machine)
         for x, y in zip(found, first, strict=True):
             np.testing.assert_array_equal(x, y, err_msg=case)
     return first
@@ -63,7 +63,7 @@ def assert_same_basins(kind):
         found = [(x.period, x.impacts, x.starts) for x in basins.attractors]
         grid = np.asarray(basins.data.label) if machine.phase == 0 else None
         first = (found, grid) if first is None else first
-        case = f"{machine.scales} {machine.phase} {machine.is_flipped}"
+        case = str(machine)
         if machine.phase == 0:
             assert found == first[0], case
             np.testing.assert_array_equal(grid, first[1], err_msg=case)
