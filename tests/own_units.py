@@ -1,5 +1,5 @@
-"""Ten machines in which time and each component have a unit of their own, as parameters. A change of
-these units, of the section or of the order of contacts and events does not change an answer."""
+"""Ten machines in which time and each component have units of their own, as parameters: a change of
+these, of the section or of the order of contacts and events does not change an answer."""
 
 from collections.abc import Iterator
 from typing import Any, ClassVar

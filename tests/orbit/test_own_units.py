@@ -19,11 +19,8 @@ def found_by(machine):
 
 
 def numbers_of(orbit):
-    sizes = np.sort(np.abs(orbit.multipliers))
-    return np.array([*sizes, orbit.duration / orbit.machine.time]), (
-        int(orbit.impacts),
-        int(orbit.rests),
-    )
+    sizes, duration = np.sort(np.abs(orbit.multipliers)), orbit.duration / orbit.machine.time
+    return np.array([*sizes, duration]), (int(orbit.impacts), int(orbit.rests))
 
 
 def assert_same_orbits(kind, tolerance):
