@@ -25,7 +25,7 @@ from .kinds import CROSSING, DOUBLING, FOLD, KINDS, REST, SLIDING, TORUS, TOUCHI
 from .rest import Chatter
 from .results import compound
 from .sliding import excess_rates
-from .tolerances import LOCATED
+from .tolerances import FAINT, LOCATED
 
 _SECTION = "section_"
 
@@ -80,10 +80,6 @@ def rates_at(
         return {name: quantity_at(problem, x, observed, name) for name in names}
 
     return jax.jvp(values, (x,), (direction,))
-
-
-# Multipliers are equal within this distance: a choice, far above their errors at a located point.
-_DOUBLE = 1e-4
 
 
 class AbstractCondition(eqx.Module):
@@ -295,8 +291,8 @@ def is_defective(problem: Shooting, step: Step, multiplier: float) -> bool:
 
     sizes, M = np.asarray(problem.sizes)[1:], step.observed.monodromy
     matrix = M * sizes / sizes[:, None]
-    is_equal = lambda value: abs(value - multiplier) <= _DOUBLE
+    is_equal = lambda value: abs(value - multiplier) <= FAINT
     # Only the part of the matrix in the plane of both counts: near a grazing the others are large.
     found: Any = schur(matrix, output="complex", sort=is_equal)
     triangle, _, equal = found
-    return bool(equal < 2 or abs(triangle[0, 1]) > _DOUBLE)
+    return bool(equal < 2 or abs(triangle[0, 1]) > FAINT)
