@@ -26,10 +26,6 @@ K_RANGE, C_RANGE = (0.02, 0.999), (0.0, 1.2)
 
 SHORT, SHORT_FILL = color_of(1, 1), paler(color_of(1, 1), 0.2)
 LONG_FILL = paler(color_of(2, 1), 0.4)
-    color_of(1, 1),
-    paler(color_of(1, 1), 0.2),
-    paler(color_of(2, 1), 0.4),
-)
 # Darker than the filling, to be visible on it.
 LONG = "#b87f00"
 

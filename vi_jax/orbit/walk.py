@@ -17,7 +17,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._checks import count, from_host, given_number
-from .._messages import Interrupted, ReportProgress, at_work, warn
+from .._messages import ReportProgress, at_work, warn
 from .._types import Vector
 from ..machine import nearest_images
 from .corrector import Step, advance, distance_along, on_host, step_error
@@ -176,10 +176,8 @@ def follow_both_ways(
             ends=(back.end, ahead.end), special=special,
         )  # fmt: skip
 
-    def interrupted() -> Interrupted:
-        return Interrupted(f"walk along the {what}", make_result())
-
-    with at_work(what, interrupted, progress=progress, unit="point") as report:
+    walk = f"walk along the {what}"
+    with at_work(walk, make_result, progress=progress, unit="point") as report:
         ahead.end = ahead.walk(report, **settings)
         back.end = CLOSED if ahead.end == CLOSED else back.walk(report, **settings)
     return make_result()

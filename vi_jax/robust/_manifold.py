@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from .._checks import flag, given_number, one_of
-from .._messages import Interrupted, at_work
+from .._messages import at_work
 from .._types import State
 from ..machine import AbstractMachine, Summarized, in_rows, is_autonomous, without_modes
 from ..orbit import Orbit, cycle_map
@@ -113,10 +113,8 @@ def manifold(
         first, second = (jax.vmap(saddle.map.state)(saddle.states(part)) for part in parts)
         return Manifold(orbit, which, (first, second), (lengths[0], lengths[1]), orbit.machine)
 
-    def kept() -> Interrupted | None:
-        return Interrupted("manifold", result()) if any(lengths) else None
-
-    with at_work("manifold", kept, progress=progress, unit="point") as report:
+    found = lambda: result() if any(lengths) else None
+    with at_work("manifold", found, progress=progress, unit="point") as report:
         for i, side in enumerate((1.0, -1.0)):
             for rows, lengths[i] in grow(saddle, side, length, spacing):
                 parts[i].append(rows)

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .._checks import count, flag, given_number, interval
-from .._messages import Interrupted, at_work
+from .._messages import at_work
 from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, components, in_rows, state_in_words, units_of
@@ -472,18 +472,16 @@ def minimal_kick(
     kick = _kick_of(settling, start, components, weights or {}, bounds or {})
     kicks: list[MinimalKick] = []
 
-    def kept() -> Interrupted | None:
-        return Interrupted("search for kicks", _smallest(kicks, settling)) if kicks else None
-
-    with at_work("minimal kick", kept, progress=progress, unit="start") as settling.report:
+    found = lambda: _smallest(kicks, settling) if kicks else None
+    with at_work("search for kicks", found, progress=progress, unit="start") as settling.report:
         if phase > 0:
             settling, start = settling.at_phase(start, phase)
             kick = dataclasses.replace(kick, start=start)
         rays = first_exits(settling, kick, directions, points, largest, seed)
         angle = 2 * np.pi / directions ** (1 / max(1, kick.size - 1))  # between neighbours
         for unit, radius in nearest_first(rays, candidates):
-            found = _exact(settling, kick, unit, radius, angle, longest, seed)
-            new = _described(settling, kick, found, longest, cycle, phase)
+            exact = _exact(settling, kick, unit, radius, angle, longest, seed)
+            new = _described(settling, kick, exact, longest, cycle, phase)
             if all(_distance(new, old) > _SAME for old in kicks):
                 kicks.append(new)
     return _smallest(kicks, settling)

@@ -22,7 +22,7 @@ from jaxtyping import Array
 
 from .. import lanes
 from .._checks import axes_of, count, fits_records, flag, instance_of
-from .._messages import Interrupted, at_work, warn, warning_once
+from .._messages import IN_PARTIAL, at_work, warn, warning_once
 from .._programs import PLAIN, CompiledFunction
 from .._types import State, xr
 from ..flow import REASON_NAMES, MethodLike, RunOptions, compiling
@@ -47,11 +47,11 @@ _PATIENCE = 10.0
 _LONG = 6
 
 
-def interrupted(data: "xr.Dataset", store: str | Path | None) -> Interrupted:
+def place_in_words(store: str | Path | None) -> str:
+    """Return the place of the results of an interrupted scan."""
     if store is None:
-        return Interrupted("scan", data)
-    where = f"what was computed is in {store}, and the same call continues from there"
-    return Interrupted("scan", data, where)
+        return IN_PARTIAL
+    return f"what was computed is in {store}, and the same call continues from there"
 
 
 class Workplace(NamedTuple):
@@ -91,8 +91,8 @@ def computed(
         _ = xr.Dataset  # loaded now: an interrupt should not wait for that
         done = blocks.total - sum(map(_size_of, todo))
         with at_work(
-            "scan", lambda: interrupted(storage.data(), store),
-            progress=progress, unit="lane", total=blocks.total, done=done,
+            "scan", storage.data, progress=progress, unit="lane", total=blocks.total, done=done,
+            where=place_in_words(store),
         ) as report:  # fmt: skip
 
             def write(where: Where, numbers: dict[str, np.ndarray]) -> None:
