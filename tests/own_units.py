@@ -1,5 +1,5 @@
-"""Ten machines in which each component has a unit of its own, as a parameter. A change of these
-units, of the section or of the order of contacts and events does not change an answer."""
+"""Ten machines in which time and each component have units of their own, as parameters: a change of
+these, of the section or of the order of contacts and events does not change an answer."""
 
 from collections.abc import Iterator
 from typing import Any, ClassVar
@@ -20,8 +20,11 @@ class _InUnits(vi.AbstractMachine):
     scales: Any
     p: Any
     phase: Any = 0.0
+    time: Any = 1.0
     is_flipped: bool = eqx.field(static=True, default=False)
 
+    length: ClassVar[float | None] = None
+    """The cycle of a driven machine in the first unit of time."""
     names: ClassVar[tuple[str, ...]]
     begins: ClassVar[tuple[float, ...]]
     value: ClassVar[float]
@@ -31,13 +34,17 @@ class _InUnits(vi.AbstractMachine):
     linked: ClassVar[tuple[tuple[int, ...], ...]] = ()
     """Components with one unit."""
 
+    @property
+    def cycle(self):
+        return self.length * self.time
+
     def start(self):
         return vi.State(**{n: self.scales[i] * self.begins[i] for i, n in enumerate(self.names)})
 
     def field(self, t, z, *modes):
         values = [getattr(z, n) / self.scales[i] for i, n in enumerate(self.names)]
-        rates = self.rates(t, *values, *modes)
-        return {n: self.scales[i] * rates[i] for i, n in enumerate(self.names)}
+        rates = self.rates(t / self.time, *values, *modes)
+        return {n: self.scales[i] * rates[i] / self.time for i, n in enumerate(self.names)}
 
     def row(self, state):
         """Return a state in the first units."""
@@ -48,7 +55,7 @@ class Struck(_InUnits):
     """A body between two stops, a filter and a slow sum."""
 
     names, begins, value, bounds = ("x", "u", "q", "w"), (0.1, 0.2, 0.0, 0.0), 0.6, (0.45, 0.9)
-    cycle = 2 * np.pi / 0.8
+    length = 2 * np.pi / 0.8
 
     @property
     def contacts(self):
@@ -65,12 +72,12 @@ class Rubbed(_InUnits):
     """Dry friction next to a stop, with a pressure."""
 
     names, begins, value, bounds = ("x", "u", "P", "w"), (0.1, 0.2, 100.0, 0.0), 0.4, (0.1, 0.8)
-    cycle = 2 * np.pi / 0.4
+    length = 2 * np.pi / 0.4
 
     @property
     def contacts(self):
         x, u, *_ = self.scales
-        rubs = vi.DryFriction(self.p * u, on="u")
+        rubs = vi.DryFriction(self.p * u / self.time, on="u")
         return ordered(self.is_flipped, rubs, vi.RigidStop(0.9 * x, 0.6, on=("x", "u")))
 
     def rates(self, t, x, u, P, w):
@@ -83,15 +90,15 @@ class Cushioned(_InUnits):
 
     names, begins, value, bounds = ("x", "u", "P", "w"), (0.1, 0.2, 100.0, 0.0), 0.5, (0.3, 0.9)
     linked = ((0, 1),)
-    cycle = 2 * np.pi / 0.9
+    length = 2 * np.pi / 0.9
 
     @property
     def contacts(self):
-        more = {"adhesive": False, "on": ("x", "u")}
+        x, time, more = self.scales[0], self.time, {"adhesive": False, "on": ("x", "u")}
         return ordered(
             self.is_flipped,
-            vi.SoftStop(self.p * self.scales[0], 40.0, damping=0.2, **more),
-            vi.SoftStop(0.7 * self.scales[0], 30.0, damping=0.1, side="left", **more),
+            vi.SoftStop(self.p * x, 40.0 / time**2, damping=0.2, **more),
+            vi.SoftStop(0.7 * x, 30.0 / time**2, damping=0.1, side="left", **more),
         )
 
     def rates(self, t, x, u, P, w):
@@ -103,7 +110,7 @@ class Heater(_InUnits):
     """A switch with hysteresis in a room of varying temperature."""
 
     names, begins, value, bounds = ("T", "room", "sum"), (300.0, 285.0, 0.0), 1.7, (1.5, 1.9)
-    cycle, modes = 1.0, {"on": 0.0}
+    length, modes = 1.0, {"on": 0.0}
 
     @property
     def events(self):
@@ -124,12 +131,12 @@ class Belted(_InUnits):
     """A body on a belt. Cycles end with its turns."""
 
     names, begins, value, bounds = ("x", "u", "w"), (1.2, 0.2, 0.0), 0.6, (0.3, 2.5)
-    cycle = vi.rising("u", usual=6.3)
+    cycle = vi.rising("u", usual=lambda m: 6.3 * m.time)
 
     @property
     def contacts(self):
         speed = self.scales[1]
-        level = lambda v: speed * (0.5 + 0.5 * jnp.exp(-2 * v / speed))
+        level = lambda v: speed * (0.5 + 0.5 * jnp.exp(-2 * v / speed)) / self.time
         return vi.DryFriction(level, slip=lambda z: z.u - self.p * speed, on="u")
 
     def rates(self, t, x, u, w):
@@ -140,7 +147,7 @@ class Valve(_InUnits):
     """A body that excites itself strikes a stop; with a pressure."""
 
     names, begins, value, bounds = ("x", "u", "P"), (0.2, 0.0, 100.0), 0.8, (0.3, 1.2)
-    cycle = vi.rising("u", usual=6.3)
+    cycle = vi.rising("u", usual=lambda m: 6.3 * m.time)
 
     @property
     def contacts(self):
@@ -154,7 +161,7 @@ class Sliding(_InUnits):
     """A surface along which the state slides, and impacts that are resets with wear."""
 
     names, begins, value, bounds = ("x", "u", "w"), (0.5, 0.3, 0.0), 0.5, (0.2, 0.9)
-    cycle = 2 * np.pi / 0.5
+    length = 2 * np.pi / 0.5
 
     @property
     def events(self):
@@ -178,13 +185,19 @@ class _Linked(vi.Mechanical):
     scales: Any
     p: Any
     phase: Any = 0.0
+    time: Any = 1.0
     is_flipped: bool = eqx.field(static=True, default=False)
 
+    length: ClassVar[float | None] = None
     q = ("a", "b")
     linked: ClassVar[tuple[tuple[int, ...], ...]] = ()
     names: ClassVar[tuple[str, ...]] = q
     inertia: ClassVar[Any]
     begins: ClassVar[tuple[float, ...]]
+
+    @property
+    def cycle(self):
+        return self.length * self.time
 
     def start(self):
         return self.at(**{n: self.scales[i] * self.begins[i] for i, n in enumerate(self.q)})
@@ -193,21 +206,22 @@ class _Linked(vi.Mechanical):
         return jnp.asarray(self.inertia) / jnp.outer(self.scales, self.scales)
 
     def force(self, t, q, v):
-        states = [getattr(x, n) / self.scales[i] for x in (q, v) for i, n in enumerate(self.q)]
-        found = self.forces(t, *states)
-        return {n: found[i] / self.scales[i] for i, n in enumerate(self.q)}
+        found = self.forces(t / self.time, *self.numbers(q, v))
+        return {n: found[i] / self.scales[i] / self.time**2 for i, n in enumerate(self.q)}
+
+    def numbers(self, q, v):
+        return [x * unit / self.scales[i] for part, unit in ((q, 1.0), (v, self.time))
+                for i, x in enumerate(getattr(part, n) for n in self.q)]  # fmt: skip
 
     def row(self, state):
-        states = (getattr(x, n) / self.scales[i] for x in (state, state.v)
-                  for i, n in enumerate(self.q))  # fmt: skip
-        return np.stack(list(states))
+        return np.stack(self.numbers(state, state.v))
 
 
 class Pair(_Linked):
     """Two bodies with a spring and a full mass matrix, each with a stop."""
 
     inertia, begins, value, bounds = ((1.0, 0.2), (0.2, 2.0)), (0.1, 0.0), 0.5, (0.3, 0.75)
-    cycle = 2 * np.pi / 0.7
+    length = 2 * np.pi / 0.7
 
     @property
     def contacts(self):
@@ -225,13 +239,13 @@ class Colliding(_Linked):
     """Two bodies that strike each other, one with dry friction."""
 
     inertia, begins, value, bounds = ((1.0, 0.0), (0.0, 1.5)), (0.1, 0.5), 0.3, (0.1, 0.6)
-    cycle = 2 * np.pi / 0.9
+    length = 2 * np.pi / 0.9
 
     @property
     def contacts(self):
         a, b = self.scales
         between = vi.RigidStop(self.p, 0.6, on=lambda q: q.a / a - q.b / b)
-        return ordered(self.is_flipped, between, vi.DryFriction(0.1 / b, on="b"))
+        return ordered(self.is_flipped, between, vi.DryFriction(0.1 / b / self.time**2, on="b"))
 
     def forces(self, t, a, b, va, vb):
         return jnp.cos(0.9 * t + self.phase) - a - 0.1 * va, -1.3 * b - 0.2 * vb
@@ -242,7 +256,7 @@ class Cranked(_Linked):
 
     q = names = ("phi", "y")
     value, bounds, linked = 0.9, (0.6, 1.1), ((1,),)
-    cycle = vi.turn_of("phi", usual=0.45)
+    cycle = vi.turn_of("phi", usual=lambda m: 0.45 * m.time)
 
     @property
     def contacts(self):
@@ -257,20 +271,18 @@ class Cranked(_Linked):
         return torque - 0.04 * spring * jnp.sin(phi), -spring - 0.5 * v
 
     def start(self):
-        return self.at(v={"phi": 14.0})
+        return self.at(v={"phi": 14.0 / self.time})
 
 
 MACHINES = (Struck, Rubbed, Cushioned, Heater, Belted, Valve, Sliding, Pair, Colliding, Cranked)
 
 
-def is_driven(kind):
-    return isinstance(kind.cycle, float)
-
-
-def machine_of(kind, scales=None, phase=0.0, *, is_flipped=False, p=None):
+def machine_of(kind, scales=None, phase=0.0, *, is_flipped=False, p=None, time=1.0):
     scales = np.ones(len(kind.names)) if scales is None else scales
-    numbers = (jnp.asarray(x, float) for x in (scales, kind.value if p is None else p, phase))
-    return kind(*numbers, is_flipped=is_flipped)
+    if kind is Cushioned:  # the velocity is the rate of the position
+        scales = scales / np.array([1.0, time, 1.0, 1.0])
+    numbers = scales, kind.value if p is None else p, phase, time
+    return kind(*(jnp.asarray(x, float) for x in numbers), is_flipped=is_flipped)
 
 
 def units_of(kind):
@@ -281,11 +293,17 @@ def units_of(kind):
     return [np.where(np.isin(np.arange(number), x), f, 1.0) for x in alone for f in FACTORS]
 
 
-def variants(kind) -> Iterator[Any]:
-    """Yield a machine in its first units, then in others, and if it is driven with another section
-    and in another order of contacts and events."""
+def in_units(kind) -> Iterator[Any]:
+    """Yield a machine in its first units, then in other units of each component and of time."""
     yield machine_of(kind)
     yield from (machine_of(kind, scales) for scales in units_of(kind))
-    if is_driven(kind):
+    yield from (machine_of(kind, time=factor) for factor in FACTORS)
+
+
+def variants(kind) -> Iterator[Any]:
+    """Yield a machine in all units, and if it is driven with another section and in another order
+    of contacts and events."""
+    yield from in_units(kind)
+    if kind.length is not None:
         yield machine_of(kind, phase=0.37)
         yield machine_of(kind, is_flipped=True)

@@ -27,10 +27,10 @@ class Block(vi.Mechanical):
     @property
     def contacts(self):
         a, h, found = self.half_width, self.half_height, []
-        for side in (-1.0, 1.0):
+        for side, name in ((-1.0, "left"), (1.0, "right")):
             height = lambda q, b=side: q.y + b * a * jnp.sin(q.tilt) - h * jnp.cos(q.tilt)
             place = lambda q, b=side: q.x + b * a * jnp.cos(q.tilt) + h * jnp.sin(q.tilt)
-            rubs = dict(friction=self.mu, along=place)
+            rubs = dict(friction=self.mu, along=place, name=name)
             found.append(vi.RigidStop(0.0, self.restitution, "left", on=height, **rubs))
         return tuple(found)
 

@@ -18,6 +18,9 @@ ReportProgress = Callable[[int], Any]
 """A function of the number of further units of work that are done."""
 
 
+IN_PARTIAL = "what was computed is in `.partial`"
+
+
 class Interrupted(KeyboardInterrupt):
     """The exception that a long function raises on Ctrl-C if it has partial results.
 
@@ -31,9 +34,7 @@ class Interrupted(KeyboardInterrupt):
     found so far, and `AllOrbits` has the searched periods. A `Grazing` lacks the simulated motions.
     `scan`, `basins` and `integrity_profile` return the data set."""
 
-    def __init__(
-        self, what: str, partial: object, where: str = "what was computed is in `.partial`"
-    ):
+    def __init__(self, what: str, partial: object, where: str = IN_PARTIAL):
         super().__init__(f"the {what} was interrupted; {where}")
         self.partial = partial
 
@@ -45,24 +46,25 @@ def silent(done: int) -> None:
 @contextmanager
 def at_work(
     what: str,
-    kept: Callable[[], Interrupted | None],
+    partial: Callable[[], Any],
     *,
     progress: bool,
     unit: str = "it",
     total: int | None = None,
     done: int = 0,
+    where: str = IN_PARTIAL,
 ) -> Iterator[ReportProgress]:
     """Show a progress bar during a long part of a function, and keep its results on Ctrl-C.
 
     Yield a function of the number of units done since its last call. It updates the bar, and raises
     an interrupt that Python dropped.
 
-    **Arguments:** `what`, the word before the bar; `kept`, a function called on Ctrl-C that returns
-    an `Interrupted` with the partial results, or `None` without such; `progress`, whether to
-    show a bar (only in a terminal or a notebook); `unit`, its name; `total`, the number of units,
-    if known; `done`, the units done before.
+    **Arguments:** `what`, a noun for the work; `partial`, a function called on Ctrl-C that returns
+    the partial result, or `None` without any; `progress`, whether to show a bar (only in a terminal
+    or a notebook); `unit`, its name; `total`, the number of units, if known; `done`, the units done
+    before; `where`, the place of the partial result in words.
 
-    **Raises:** on Ctrl-C the result of `kept`, or the `KeyboardInterrupt` itself.
+    **Raises:** on Ctrl-C `Interrupted`, or the `KeyboardInterrupt` itself without a result.
     """
     from tqdm import tqdm  # slow to load
 
@@ -79,10 +81,10 @@ def at_work(
         ) as bar:  # fmt: skip
             yield report
     except KeyboardInterrupt:
-        interrupted = kept()
-        if interrupted is None:
+        found = partial()
+        if found is None:
             raise
-        raise interrupted from None
+        raise Interrupted(what, found, where) from None
 
 
 def in_parts(
@@ -102,11 +104,8 @@ def in_parts(
     import jax
 
     parts: list[Any] = []
-
-    def interrupted() -> Interrupted | None:
-        return Interrupted(what, joined(carry, parts)) if parts else None
-
-    with at_work(what, interrupted, **options) as report:
+    partial = lambda: joined(carry, parts) if parts else None
+    with at_work(what, partial, **options) as report:
         for size, piece in pieces:
             carry, part = jax.block_until_ready(step(carry, piece))
             parts.append(part)

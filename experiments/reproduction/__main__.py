@@ -3,7 +3,6 @@
 import argparse
 import os
 import sys
-import time
 from pathlib import Path
 
 # Set for both processes, and before JAX is imported. One run is too short for a GPU.
@@ -12,15 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tools.kept import keep_programs
 
-from reproduction.report import KEPT, STEPS, differences, read, reproduce, summary
-
-BEGIN = time.perf_counter()
-
-
-def tell(step: str) -> None:
-    """Print the step that begins, and the elapsed seconds."""
-    count = f"{STEPS.index(step) + 1}/{len(STEPS)}"
-    print(f"[{time.perf_counter() - BEGIN:3.0f} s] {count} {step} …", file=sys.stderr, flush=True)
+from reproduction.report import KEPT, differences, read, reproduce, summary
 
 
 def main() -> int:
@@ -34,7 +25,7 @@ def main() -> int:
     out = parser.parse_args().out
     keep_programs()
     try:
-        found = reproduce(out, tell)
+        found = reproduce(out)
     except KeyboardInterrupt:
         print(f"interrupted; what was written is in {out}", file=sys.stderr)
         return 130

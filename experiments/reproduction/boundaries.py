@@ -24,10 +24,19 @@ from .response import MAX_STEP, RANGE, RATIO
 # At k = 1 without damping the motions are no longer isolated, and the curves end there.
 K_RANGE, C_RANGE = (0.02, 0.999), (0.0, 1.2)
 
-SHORT, LONG = color_of(1, 1), color_of(2, 1)
+SHORT, SHORT_FILL = color_of(1, 1), paler(color_of(1, 1), 0.2)
+LONG_FILL = paler(color_of(2, 1), 0.4)
 # Darker than the filling, to be visible on it.
-LONG_LINE = "#b87f00"
-SHORT_FILL, LONG_FILL = paler(SHORT, 0.2), paler(LONG, 0.4)
+LONG = "#b87f00"
+
+# Beginning of a curve's name, colour, kind and label of the lines in both planes.
+LINES = (
+    ("birth", SHORT, "grazing", "2π: born by grazing"),
+    ("doubling", SHORT, "period-doubling", "2π: period doubling"),
+    ("fold", SHORT, "fold", "2π: fold"),
+    ("touch", LONG, "grazing", "4π: touches the stop again"),
+    ("long_doubling", LONG, "period-doubling", "4π: period doubling"),
+)
 
 # The curves in the planes (ζ, k), undamped, and (ζ, ξ), with k = 0.5; d = 2 in both. The 2π motion
 # has one impact per drive cycle, the 4π motion has one in two cycles. The start of each curve:
@@ -54,11 +63,12 @@ Curves = Mapping[str, Boundary]
 """Curves by the names of `CURVES`."""
 
 
-# c of Table 1 (N·s/m), and ξ of c = 1 N·s/m in its machine.
+# c of Table 1, in N·s/m.
 TABLE_DAMPING = float(Parameters().damping)
 
 
 def xi_per_c() -> float:
+    """Return ξ of c = 1 N·s/m in the machine of Table 1."""
     return table_damping_ratio() / TABLE_DAMPING
 
 
@@ -172,22 +182,15 @@ def draw_boundaries(curves: Curves) -> Figure:
     figure = Figure(figsize=(12.5, 9.6), dpi=110)
     figure.set_layout_engine("constrained", w_pad=0.08)
     grid = figure.subplots(2, 2, width_ratios=(1.0, 1.25))
-    for row, plane in zip(grid, ("k", "c"), strict=True):
+    for row, plane in zip(grid, "kc", strict=True):
         for ax, zoom in zip(row, (False, True), strict=True):
             _draw(ax, curves, plane, zoom)
-    lines = (
-        (SHORT, "grazing", "2π: born by grazing"),
-        (SHORT, "period-doubling", "2π: period doubling"),
-        (SHORT, "fold", "2π: fold"),
-        (LONG_LINE, "grazing", "4π: touches the stop again"),
-        (LONG_LINE, "period-doubling", "4π: period doubling"),
-    )
     line = partial(Line2D, [], [])
     marks = (("*", 11, "Figs. 3 and 4: k = 0.5, ζ = 0.9"), ("P", 9, "the same with Table 1's c"))
     handles = [
         Patch(color=SHORT_FILL, label="2π motion unstable"),
         Patch(color=LONG_FILL, label="4π with one impact, the paper's family"),
-        *(line(color=color, lw=1.8, ls=DASHES[kind], label=label) for color, kind, label in lines),
+        *(line(color=color, lw=1.8, ls=DASHES[kind], label=x) for _, color, kind, x in LINES),
         *(line(color="k", marker=x, ls="none", ms=size, label=label) for x, size, label in marks),
     ]
     legend_below(figure, handles, 3, fontsize=10)
@@ -201,41 +204,27 @@ def _draw(ax: Axes, curves: Curves, plane: str, zoom: bool) -> None:
     in_k = plane == "k"
     low, high = K_RANGE if in_k else C_RANGE
     levels = np.linspace(low, high, 400)
-    birth, doubling, touch, fold = (
-        plane_points(curves[name])
-        for name in ("birth_c", f"doubling_{plane}", f"touch_{plane}", f"fold_{plane}")
-    )
+    names = {name: f"{name}_{plane}" for name, *_ in LINES}
+    parts = {name: [plane_points(curves[x])] for name, x in names.items() if x in curves}
     if in_k:
-        birth = np.array([[_birth_without_damping(curves), y] for y in (low, high)])
+        parts["birth"] = [np.array([[_birth_without_damping(curves), y] for y in (low, high)])]
     # Birth and doubling are functions ζ(k) and ζ(c).
-    left, right = (_over(points, levels) for points in (birth, doubling))
+    left, right = (_over(parts[name][0], levels) for name in ("birth", "doubling"))
     ax.fill_betweenx(levels, left, right, color=SHORT_FILL, lw=0, zorder=0)
-    ax.fill(*touch.T, color=LONG_FILL, lw=0, zorder=1)
-    upper = np.column_stack([births(xi_per_c() * levels * (not in_k))[1], levels])
-    lines = [
-        (birth, SHORT, "grazing"),
-        (upper, SHORT, "grazing"),
-        (doubling, SHORT, "period-doubling"),
-        (touch, LONG_LINE, "grazing"),
-        (fold, SHORT, "fold"),
-    ]
-    if in_k:
-        lines.insert(4, (plane_points(curves["long_doubling_k"]), LONG_LINE, "period-doubling"))
-    for points, color, kind in lines:
-        ax.plot(*points.T, color=color, lw=1.8, ls=DASHES[kind])
+    ax.fill(*parts["touch"][0].T, color=LONG_FILL, lw=0, zorder=1)
+    parts["birth"].append(np.column_stack([births(xi_per_c() * levels * (not in_k))[1], levels]))
+    for name, color, kind, _ in LINES:
+        for points in parts.get(name, ()):
+            ax.plot(*points.T, color=color, lw=1.8, ls=DASHES[kind])
     ax.plot(FREQUENCY_RATIO, RESTITUTION if in_k else 0.0, "k*", ms=11, clip_on=False, zorder=6)
     if not in_k:
         ax.axhline(TABLE_DAMPING, color="k", lw=1.0, ls=":")
         ax.plot(FREQUENCY_RATIO, TABLE_DAMPING, "kP", ms=9, zorder=6)
         if not zoom:
-            ax.text(
-                0.99, TABLE_DAMPING, "c of Table 1", transform=ax.get_yaxis_transform(),
-                ha="right", va="bottom", fontsize=10,
-            )  # fmt: skip
-    ax.set_xlim(*((0.68, 1.02) if zoom else RANGE))
-    ax.set_ylim(low, 1.0 if in_k else high)
-    ax.set_xlabel("frequency ratio ζ")
-    ax.set_ylabel("restitution k" if in_k else "damping c (N·s/m)")
+            place = {"transform": ax.get_yaxis_transform(), "ha": "right", "va": "bottom"}
+            ax.text(0.99, TABLE_DAMPING, "c of Table 1", fontsize=10, **place)
+    ax.set(xlim=(0.68, 1.02) if zoom else RANGE, ylim=(low, 1.0 if in_k else high))
+    ax.set(xlabel="frequency ratio ζ", ylabel="restitution k" if in_k else "damping c (N·s/m)")
     described = "without damping" if in_k else f"k = {RESTITUTION:g}"
     ax.set_title(f"{described}, enlarged" if zoom else described, fontsize=11)
     ax.grid(alpha=0.25, lw=0.5)

@@ -76,22 +76,14 @@ def _first_cycles(cases):
 @claim
 def _near_short(cases):
     minima = _each(cases, lambda case: np.asarray(case.from_rest.y_min)[2:4].tolist())
-    closed = _each(cases, _short_minimum)
-    growth = _each(cases, _growth)
+    closed = _each(cases, lambda case: case.short_minimum)
+    growth = _each(cases, lambda case: case.growth)
     near = np.abs(np.array(minima["undamped"]) - closed["undamped"]).max() < 0.2
     return {}, verdict(bool(near) and growth["undamped"] > 1, growth["damped"] > 1), {
         "minima_cycles_3_4": minima,
         "closed_form_minimum_2pi": closed,
         "largest_multiplier_2pi": growth,
     }  # fmt: skip
-
-
-def _short_minimum(case: Case) -> float:
-    return float(case.short.y_min[0])
-
-
-def _growth(case: Case) -> float:
-    return float(np.abs(np.asarray(case.short.multipliers[0])).max())
 
 
 def _deviation(run: Run, orbit: Run) -> np.ndarray:
@@ -121,7 +113,7 @@ def _nudged_rate(case: Case) -> float:
 
 @claim
 def _departure(cases):
-    rates, predicted = _each(cases, _nudged_rate), _each(cases, _growth)
+    rates, predicted = _each(cases, _nudged_rate), _each(cases, lambda case: case.growth)
     fits = abs(rates["undamped"] - predicted["undamped"]) < 1e-3
     return {}, verdict(fits and rates["undamped"] > 1, rates["damped"] > 1), {
         "rate_small_deviation": rates,
@@ -197,10 +189,11 @@ def _direct_short(cases):
     cycles = cases[0].on_short.impacts.shape[0]
     stays = {name: cycles if x is None else x for name, x in
              _each(cases, lambda case: _staying(case, 0.05)).items()}  # fmt: skip
-    held = "all " * (stays["undamped"] == cycles) + str(stays["undamped"])
-    return {"held": held}, verdict(stays["undamped"] >= min(cycles, 100)), {
+    held = stays["undamped"]
+    words = {"held": "all " * (held == cycles) + str(held)}
+    return words, verdict(held >= min(cycles, 100)), {
         "cycles_within_0.05": stays,
-        "largest_multiplier_2pi": _each(cases, _growth),
+        "largest_multiplier_2pi": _each(cases, lambda case: case.growth),
         "cycles": cycles,
     }  # fmt: skip
 
@@ -234,7 +227,7 @@ def _maximum(panels, cases):
 @claim
 def _minimum(cases):
     simulated = _each(cases, lambda case: last_minima(case.from_rest)[0])
-    analysis = _each(cases, _short_minimum)
+    analysis = _each(cases, lambda case: case.short_minimum)
     differ = {name: abs(simulated[name] - analysis[name]) > 0.1 for name in simulated}
     return {}, verdict(differ["undamped"], differ["damped"]), {
         "simulated": simulated,
@@ -270,11 +263,8 @@ def _free(found):
 def _everywhere(panels):
     apart = {name: (at["apart"], at["values"]) for name, at in _sweeps(panels).items()}
     some, full = (sum(x[i] for x in apart.values()) for i in (0, 1))
-    names = "restitution", "damping_ratio", "BB", "CC"
-    lines = listed(
-        "k = {:g}, ξ = {:.3f}: {:.5f} to {:.5f}", [tuple(map(x.get, names)) for x in panels]
-    )
-    words = {"some": some, "all": full, "lines": lines}
+    pattern = "k = {0[restitution]:g}, ξ = {0[damping_ratio]:.3f}: {0[BB]:.5f} to {0[CC]:.5f}"
+    words = {"some": some, "all": full, "lines": listed(pattern, panels)}
     return words, verdict(True, some == full, PARTLY), {"apart_and_values": apart}
 
 
@@ -288,16 +278,14 @@ def _reason(panels):
 
 @claim
 def _wall(panels):
-    keys = {"values": "values", "analysis_clear": "analysis_clear_of_the_wall",
-            "sweep_reaches": "sweep_reaches_the_wall"}  # fmt: skip
-    sweeps = {name: {key: at[x] for key, x in keys.items()} for name, at in _sweeps(panels).items()}
-    counts = [(name, x["sweep_reaches"], x["values"]) for name, x in sweeps.items()]
-    clear = all(x["analysis_clear"] == x["values"] for x in sweeps.values())
-    reach = [count for _, count, _ in counts]
-    where = "everywhere" if clear else "not everywhere"
-    words = {"where": where, "parts": listed("{} {} of {}", counts)}
-    judged = verdict(clear and any(reach), all(reach), PARTLY)
-    return words, judged, {"wall": WALL, "sweeps": sweeps}
+    keys = "values", "analysis_clear_of_the_wall", "sweep_reaches_the_wall"
+    counts = {name: [at[key] for key in keys] for name, at in _sweeps(panels).items()}
+    clear = all(free == values for values, free, _ in counts.values())
+    reach = [reached for *_, reached in counts.values()]
+    parts = listed("{} {} of {}", [(name, x[2], x[0]) for name, x in counts.items()])
+    words = {"where": "everywhere" if clear else "not everywhere", "parts": parts}
+    numbers = {"wall": WALL, "values_clear_reached": counts}
+    return words, verdict(clear and any(reach), all(reach), PARTLY), numbers
 
 
 @claim
@@ -313,11 +301,8 @@ def _crank_phase(case):
         ends.append(float(Y[-2:].min()))
     near = [max(x) < _NEAR for x in apart.values()]
     settled = all(abs(y - float(case.long.y_min[0])) < 1e-2 for y in ends)
-    items = [(*x, name) for name, x in apart.items()]
-    words = {
-        "parts": listed("{:.2f}/{:.2f} at {}π", items, ", "),
-        "settled": "all" if settled else "not all",
-    }
+    parts = listed("{:.2f}/{:.2f} at {}π", [(*x, name) for name, x in apart.items()], ", ")
+    words = {"parts": parts, "settled": "all" if settled else "not all"}
     numbers = {"max_difference_cycles_3_4_by_phase_over_pi": apart, "last_minima": ends}
     return words, verdict(near[0], all(near), PARTLY), numbers
 
@@ -331,9 +316,8 @@ def _cosine(case):
     )
     start = scene.start(Y=case.long.Y[0], V=case.long.V[0])
     run = simulate(scene, start, CYCLES, throw=True)
-    Y = np.asarray(run.sections.Y)
-    repeats, impacts = float(np.abs(Y[-1] - Y[-3])), int(np.sum(np.asarray(run.impacts)[-2:]))
-    words = {"cycles": CYCLES, "impacts": impacts}
+    Y, impacts = np.asarray(run.sections.Y), int(np.sum(np.asarray(run.impacts)[-2:]))
+    repeats, words = float(np.abs(Y[-1] - Y[-3])), {"cycles": CYCLES, "impacts": impacts}
     return words, verdict(repeats < 1e-6 and impacts == 1), {
         "minima_exact": last_minima(run),
         "minima_cosine": last_minima(case.from_long),

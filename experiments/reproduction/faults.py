@@ -21,6 +21,11 @@ def check_faults() -> list[Fault]:
     return [check(number) for number, check in enumerate(checks, 1)]
 
 
+def _drift(**printed: float) -> float:
+    """Return `energy_drift` of Table 1's machine with these coefficients in place of its own."""
+    return energy_drift(**_groups(), **printed)
+
+
 def _groups() -> dict[str, float]:
     """Return ε and μ of Table 1's machine, as arguments of `energy_drift`."""
     drive: Any = Parameters().scene().drive
@@ -34,28 +39,23 @@ def _table(*names: str) -> list[float]:
 
 @fault
 def _inertia_term():
-    groups, inertia = _groups(), _groups()["slider_inertia"]
-    printed = {
-        "printed_in_metres": inertia / _table("crank_radius")[0],
-        "printed_in_crank_radii": inertia,
-        "right": 0.0,
-    }
+    inertia, (radius,) = _groups()["slider_inertia"], _table("crank_radius")
     return {}, {
-        f"energy_drift_{name}": energy_drift(**groups, printed_inertia=x)
-        for name, x in printed.items()
+        "energy_drift_printed_in_metres": _drift(printed_inertia=inertia / radius),
+        "energy_drift_printed_in_crank_radii": _drift(printed_inertia=inertia),
+        "energy_drift_right": _drift(),
     }
 
 
 @fault
 def _coupling():
-    c, k0 = _table("damping", "stiffness")
-    groups, right = _groups(), _groups()["coupling"]
+    (c, k0), right = _table("damping", "stiffness"), _groups()["coupling"]
     printed = c / k0 * right
     return {"c": c, "k0": k0}, {
         "coupling_printed": printed,
         "coupling_right": right,
-        "energy_drift_printed": energy_drift(**groups, printed_coupling=printed),
-        "energy_drift_right": energy_drift(**groups),
+        "energy_drift_printed": _drift(printed_coupling=printed),
+        "energy_drift_right": _drift(),
     }
 
 

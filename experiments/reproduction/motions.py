@@ -44,6 +44,16 @@ class Case(NamedTuple):
         """True if the 4π closed form is a motion: it stays inside the gap between impacts."""
         return bool(self.long.admissible[0])
 
+    @property
+    def short_minimum(self) -> float:
+        """The smallest Y of the 2π closed form."""
+        return float(self.short.y_min[0])
+
+    @property
+    def growth(self) -> float:
+        """The largest |multiplier| of the 2π motion."""
+        return float(np.abs(np.asarray(self.short.multipliers[0])).max())
+
 
 def figure_scene(damping_ratio: Any, *, restitution: Any = RESTITUTION, gap: Any = GAP) -> Scene:
     """Return the scene of Figures 3 and 4 with this ξ (dimensionless), at ζ = 0.90."""

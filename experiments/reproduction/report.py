@@ -10,6 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from tools.pictures import save_picture
+from tools.study import say
 from vi_jax.machines import Parameters
 from vi_jax.orbit import Boundary
 from vi_jax.plot import plot_sketch
@@ -31,21 +32,10 @@ KEPT = Path(__file__).parent / "report" / "report.json"
 # Located points agree to rounding, splines through curves to 1e-5.
 _AGREE = 1e-5
 
-STEPS = (
-    "simulating: from rest, from the 4π and from the 2π state, undamped and damped",
-    "drawing Figures 1, 3 and 4",
-    "measuring the faults of the printed text",
-    "finding the periodic motions",
-    "Figures 3 and 4 with the motor",
-    "following the boundaries of the discrepancy in (ζ, k) and (ζ, c)",
-    "waiting for Figure 2, which a second process computes",
-    "measuring what the paper claims and assumes",
-)
 
-
-def reproduce(out: Path, tell: Callable[[str], None]) -> Findings:
+def reproduce(out: Path) -> Findings:
     """Draw Figures 1 to 4 and the boundaries of the discrepancy, and write the report into a
-    folder; `tell` is called with each of `STEPS` at its beginning.
+    folder.
 
     Figure 2 is computed in a second process. Most of the time is tracing, which holds Python's
     global lock, so threads would use only one core.
@@ -55,44 +45,43 @@ def reproduce(out: Path, tell: Callable[[str], None]) -> Findings:
     end = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_DFL)}
     with ProcessPoolExecutor(1, get_context("spawn"), **end) as second:
         later = second.submit(_figure_2, out)
-        findings = _findings(out, map(tell, STEPS).__next__, later.result)
+        findings = _findings(out, later.result)
     (out / "report.json").write_text(as_json(findings), encoding="utf-8")
     (out / "report.md").write_text(as_markdown(findings), encoding="utf-8")
     return findings
 
 
-def _findings(out: Path, begin: Callable[[], None], figure_2: Callable[[], Any]) -> Findings:
-    begin()
+def _findings(out: Path, figure_2: Callable[[], Any]) -> Findings:
+    say("simulating, undamped and damped")
     cases = simulate_cases()
-    begin()
+    say("drawing Figures 1, 3 and 4")
     figure = Figure(figsize=(12, 5), layout="constrained")
     plot_sketch(Parameters().scene(), ax=figure.subplots())
     save_picture(figure, out / "fig1.png")
     for number in (3, 4):
         draw_figure(number, cases, out / f"fig{number}.png")
-    begin()
+    say("measuring the faults of the printed text")
     faults = check_faults()
-    begin()
+    say("finding the periodic motions")
     table = table_damping_ratio()
     orbits = orbit_table({
         "k = 0.5, undamped": figure_scene(0.0),
         "k = 0.5, Table 1's damping": figure_scene(table),
         "k = 0.8, Table 1's damping": figure_scene(table, restitution=0.8),
     })  # fmt: skip
-    begin()
+    say("Figures 3 and 4 with the motor")
     motor_orbits, motors = simulate_motors()
     save_picture(draw_motors(motors, cases[0].from_rest), out / "motor.png")
-    begin()
+    say("following the boundaries of the discrepancy")
     curves = follow_curves([name for name, at in CURVES.items() if at[0] == 1])
-    begin()
+    say("waiting for Figure 2, which a second process computes")
     panels, figure_2_claims, long_curves = figure_2()
     curves |= long_curves
     save_picture(draw_boundaries(curves), out / "boundaries.png")
-    begin()
     claims = check_claims(cases, panels["panels"]) + figure_2_claims
     claims += check_assumptions(cases[0], motors)
-    borders = describe_boundaries(curves)
-    return Findings(cases, claims, faults, orbits + motor_orbits, panels, borders)
+    rows = orbits + motor_orbits
+    return Findings(cases, claims, faults, rows, panels, describe_boundaries(curves))
 
 
 def _figure_2(out: Path) -> tuple[dict[str, Any], list[Claim], dict[str, Boundary]]:
@@ -114,23 +103,23 @@ def summary(claims: Sequence[Claim]) -> str:
 
 def differences(new: dict[str, Any], kept: dict[str, Any]) -> list[str]:
     """Return the differences of two reports in verdicts and special points, in words."""
-    verdicts, others = ({x["name"]: x["verdict"] for x in of["claims"]} for of in (new, kept))
-    found = [
-        f"{name}: {verdicts.get(name, 'absent')}, kept: {others.get(name, 'absent')}"
-        for name in {**others, **verdicts}
-        if verdicts.get(name) != others.get(name)
-    ]
-    places, beside = _headline_numbers(new), _headline_numbers(kept)
-    return found + [
-        f"{name}: {places.get(name)}, kept: {beside.get(name)}"
-        for name in {**beside, **places}
-        if not abs(places.get(name, float("inf")) - beside.get(name, float("inf"))) < _AGREE
+    found, wanted = _headlines(new), _headlines(kept)
+
+    def same(name: str) -> bool:
+        a, b = found.get(name), wanted.get(name)
+        return a == b or (isinstance(a, float) and isinstance(b, float) and abs(a - b) < _AGREE)
+
+    return [
+        f"{name}: {found.get(name, 'absent')}, kept: {wanted.get(name, 'absent')}"
+        for name in {**wanted, **found}
+        if not same(name)
     ]
 
 
-def _headline_numbers(report: dict[str, Any]) -> dict[str, float]:
-    """Return the boundaries of a report and the special points of its Figure 2, by name."""
-    numbers = {name: x for name, x in report["boundaries"].items() if x is not None}
+def _headlines(report: dict[str, Any]) -> dict[str, Any]:
+    """Return verdicts, boundaries and the special points of Figure 2 in a report, by name."""
+    numbers = {x["name"]: x["verdict"] for x in report["claims"]}
+    numbers |= {name: x for name, x in report["boundaries"].items() if x is not None}
     for panel in report["figure_2"]["panels"]:
         of = in_words(panel)
         numbers |= {f"{of}: BB'": panel["BB"], f"{of}: CC'": panel["CC"]}

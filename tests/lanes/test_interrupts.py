@@ -94,8 +94,10 @@ def test_interrupts_within_the_garbage_collector_are_kept(interrupt_in_collectio
     with pytest.raises(KeyboardInterrupt):
         vi.simulate(Collected(), Collected().start(), 1, settle=10**8)
     for more in (None, lambda: motion(10**8).block_until_ready()):
-        kept = functools.partial(vi.Interrupted, "work", 7)
-        with pytest.raises(vi.Interrupted) as caught, at_work("", kept, progress=False) as tell:
+        with (
+            pytest.raises(vi.Interrupted) as caught,
+            at_work("", lambda: 7, progress=False) as tell,
+        ):
             tell(1)
             interrupt_in_collection()
             gc.collect()

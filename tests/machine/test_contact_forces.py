@@ -6,30 +6,9 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
+from planar import Block
+
 HALF_WIDTH, HALF_HEIGHT, G = 0.2, 0.5, 9.81
-
-
-class Pushed(vi.Mechanical):
-    """A block on two corners, pushed by a force at its centre."""
-
-    friction: float = 0.2
-    push: float = 3.0
-    q = ("x", "y", "tilt")
-    mass = (1.0, 1.0, (HALF_WIDTH**2 + HALF_HEIGHT**2) / 3)
-    cycle = 0.1
-
-    @property
-    def contacts(self):
-        def corner(side, name):
-            high = lambda q: q.y + side * jnp.sin(q.tilt) - HALF_HEIGHT * jnp.cos(q.tilt)
-            along = lambda q: q.x + side * jnp.cos(q.tilt) + HALF_HEIGHT * jnp.sin(q.tilt)
-            grip = dict(friction=self.friction, along=along)
-            return vi.RigidStop(0.0, 0.0, "left", on=high, name=name, **grip)
-
-        return corner(-HALF_WIDTH, "left"), corner(HALF_WIDTH, "right")
-
-    def force(self, t, q, v):
-        return dict(x=self.push, y=-G, tilt=0.0)
 
 
 def test_a_pushed_block_slides_or_tips():
@@ -38,8 +17,8 @@ def test_a_pushed_block_slides_or_tips():
     friction, push = jnp.array([0.2, 0.35, 0.45]), jnp.array([3.0, 4.5, 4.5])
 
     def forces(mu, push):
-        block = Pushed(mu, push)
-        return vi.contact_forces(block, block.at(y=HALF_HEIGHT))
+        block = Block(HALF_WIDTH, HALF_HEIGHT, mu, push=push)
+        return vi.contact_forces(block, block.start())
 
     found = jax.vmap(forces)(friction, push)
     for i, mu in enumerate((0.2, 0.35)):

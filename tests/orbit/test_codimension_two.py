@@ -148,24 +148,6 @@ def test_neimark_sacker_points_and_their_resonances(torus):
     )
 
 
-@pytest.mark.parametrize("periods", [3, 4])
-def test_motions_of_three_and_of_four_periods(torus, periods):
-    """Compare the cycles near a resonance with iterates of the map."""
-    point = only(torus, f"resonance-1:{periods}")
-    for distance in (0.003, 0.01, 0.1):
-        orbit = point.switch(distance=distance)
-        x, y = first = np.array([float(value) for value in orbit.state])
-        a, b = float(orbit.machine.a), float(orbit.machine.b)
-        M, sizes = np.eye(2), []
-        for _ in range(periods):
-            M = np.array([[0, 1], [R * y - b, R * x - 2 * y]]) @ M
-            x, y = y, a - b * x - y**2 + R * x * y
-            sizes.append(np.hypot(*(np.array([x, y]) - first)))
-        assert int(orbit.cycles) == periods and sizes.pop() < 1e-12 < 1e-4 < min(sizes)
-        values = np.sort_complex(np.asarray(orbit.multipliers))
-        np.testing.assert_allclose(values, np.sort_complex(np.linalg.eigvals(M)), atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("kind", "resonant", "cosine"),
     [("fold", "resonance-1:1", 1), ("period-doubling", "resonance-1:2", -1)],

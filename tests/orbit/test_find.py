@@ -9,6 +9,8 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
+from dragging import Dragging
+
 UNDAMPED = vi.Scene.ideal(frequency_ratio=0.9)
 
 
@@ -273,32 +275,11 @@ def test_second_derivatives_where_a_body_may_rest():
     np.testing.assert_allclose(jax.grad(slope)(0.5), wanted, rtol=1e-6)
 
 
-class Pendulum(vi.Mechanical):
-    """A driven pendulum that strikes a stop and drags a stiffening spring."""
-
-    q, mass = ("x", "y"), (1.0, 0.6)
-    force_size, gap, restitution = 1.2235349288777575, 0.4590268753885736, 0.769947412071461
-    frequency = 1.563638946789845
-    cycle = 2 * np.pi / frequency
-
-    @property
-    def contacts(self):
-        return vi.RigidStop(self.gap, self.restitution, on="x")
-
-    def force(self, t, q, v):
-        spring = 0.35 * (q.x - q.y) + 0.04 * (v.x - v.y)
-        drive = self.force_size * jnp.cos(self.frequency * t)
-        return dict(
-            x=drive - jnp.sin(q.x) - 0.08 * v.x - spring,
-            y=spring - 0.9 * q.y - 0.3 * q.y**3 - 0.05 * v.y,
-        )
-
-
 @pytest.mark.slow
 def test_a_motion_of_five_cycles():
     """The tolerance is for each cycle, over which the residual sums the steps' errors. SciPy, from
     event to event, gives the multipliers by differences."""
-    machine = Pendulum()
+    machine = Dragging(1.2235349288777575, 1.563638946789845, 0.4590268753885736, 0.769947412071461)
     start = machine.at(x=-1.72001113752, y=-1.27188454372, v=dict(x=1.35574894278, y=-0.5780788535))
     orbit = vi.find_orbit(machine, start, cycles=5, throw=True)
     assert int(orbit.cycles) == 5 and int(orbit.impacts) == 5

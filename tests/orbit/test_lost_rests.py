@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
+from dragging import Dragging
 from two_coupled import Coupled, settled
 
 ZETA = "drive.frequency_ratio"
@@ -141,32 +142,13 @@ def test_a_rest_that_joins_itself():
     assert int(divided.switch().rests) == 1
 
 
-class Dragging(vi.Mechanical):
-    """A driven pendulum that is pressed on a stop and drags a stiffening spring."""
-
-    q, mass = ("x", "y"), (1.0, 0.6)
-    amplitude: float = 1.5780551531102542
-    gap, restitution, push = -0.15138035578735687, 0.5770427091485174, 0.08617047024737454
-    frequency = 0.5732534975700999
-    cycle = 2 * np.pi / frequency
-
-    @property
-    def contacts(self):
-        return vi.RigidStop(self.gap, self.restitution, on="x")
-
-    def force(self, t, q, v):
-        spring = 0.35 * (q.x - q.y) + 0.04 * (v.x - v.y)
-        drive = jnp.cos(self.frequency * t) + 0.3 * jnp.sin(2 * self.frequency * t)
-        return dict(
-            x=self.push + self.amplitude * drive - jnp.sin(q.x) - 0.08 * v.x - spring,
-            y=spring - 0.9 * q.y - 0.3 * q.y**3 - 0.05 * v.y,
-        )
-
-
 @pytest.mark.slow
 def test_the_motion_beyond_a_rest_is_as_accurate_as_the_branch():
     """Regression: it was sought with fewer steps, and did not repeat by 5e-6."""
-    machine = Dragging()
+    machine = Dragging(
+        1.5780551531102542, 0.5732534975700999, -0.15138035578735687, 0.5770427091485174,
+        push=0.08617047024737454, second=0.3,
+    )  # fmt: skip
     settled = vi.simulate(machine, machine.at(x=-0.6), 3, settle=300, rests=True).last
     orbit = vi.find_orbit(machine, settled, cycles=3, throw=True)
     branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=(0.947, 2.209), progress=False)

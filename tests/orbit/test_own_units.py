@@ -19,8 +19,8 @@ def found_by(machine):
 
 
 def numbers_of(orbit):
-    sizes = np.sort(np.abs(orbit.multipliers))
-    return np.array([*sizes, orbit.duration]), (int(orbit.impacts), int(orbit.rests))
+    sizes, duration = np.sort(np.abs(orbit.multipliers)), orbit.duration / orbit.machine.time
+    return np.array([*sizes, duration]), (int(orbit.impacts), int(orbit.rests))
 
 
 def assert_same_orbits(kind, tolerance):
@@ -31,7 +31,7 @@ def assert_same_orbits(kind, tolerance):
         orbit = found_by(machine)
         found, counts = numbers_of(orbit)
         first = first or (found, counts, machine.row(orbit.state))
-        case = f"{machine.scales} {machine.phase} {machine.is_flipped}"
+        case = str(machine)
         np.testing.assert_allclose(found, first[0], rtol=tolerance, atol=tolerance, err_msg=case)
         assert counts == first[1], case
         if machine.phase == 0:
@@ -57,7 +57,7 @@ def branches(kind):
     return [
         (
             vi.continue_orbit(found_by(machine), **options),
-            f"{machine.scales} {machine.phase} {machine.is_flipped}",
+            str(machine),
         )
         for machine in variants(kind)
     ]

@@ -75,13 +75,6 @@ def test_a_store_rejects_another_amplitude_function(tmp_path):
 
 
 @pytest.mark.slow
-def test_verification_uses_the_paths_of_the_lanes():
-    data = scan_with(verify=40, method=vi.FixedStep())
-    assert data.verified_error_V < 1e-5
-    assert np.std(data.V) > 1e-2
-
-
-@pytest.mark.slow
 def test_derivatives_with_respect_to_an_amplitude(whole):
     axes = {"noise.V": [0.05], "noise.path": [0]}
     found, step = {}, 1e-6

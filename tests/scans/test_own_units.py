@@ -27,7 +27,7 @@ def assert_same_sweeps(kind, first=None):
         found = [np.where(moves, x, 0) for x in (run.period, run.impacts)]
         found[1] = np.where(found[0] > 0, found[1], 0)
         first = found if first is None else first
-        case = f"{machine.scales} {machine.phase} {machine.is_flipped}"
+        case = str(machine)
         for x, y in zip(found, first, strict=True):
             np.testing.assert_array_equal(x, y, err_msg=case)
     return first
@@ -64,7 +64,7 @@ def assert_same_basins(kind):
         found = [(x.period, x.impacts, x.starts) for x in basins.attractors]
         grid = np.asarray(basins.data.label) if machine.phase == 0 else None
         first = (found, grid) if first is None else first
-        case = f"{machine.scales} {machine.phase} {machine.is_flipped}"
+        case = str(machine)
         if machine.phase == 0:
             assert found == first[0], case
             np.testing.assert_array_equal(grid, first[1], err_msg=case)

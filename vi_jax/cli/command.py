@@ -44,7 +44,7 @@ from ..machine import (
     with_leaves,
 )
 from ..orbit import continue_orbit, find_orbit
-from ..scans import REGIMES, Sweep, basins, scan, sweep
+from ..scans import REGIMES, basins, scan, sweep
 from .named import InputError, check_keys, machine_of, value_of
 
 _ENDINGS = {"output": (".csv", ".nc"), "picture": (".png", ".pdf", ".svg")}
@@ -239,38 +239,14 @@ def _joined(runs: list[Run]) -> Run:
     return dataclasses.replace(jtu.tree_map(row, *runs), steps=tried, rejected=rejected)
 
 
-def _sweep(
-    machine: AbstractMachine, options: dict[str, Any], *, up_and_down: bool = False,
-    y: str | None = None,
-) -> Found:  # fmt: skip
-    values = options.get("values", ())
-    order = ("up", "down") if len(values) < 2 or values[0] <= values[-1] else ("down", "up")
-    first, ended = _finished(sweep, machine, **options)
-    found: dict[str, Sweep] = {order[0]: first}
-    if up_and_down and not ended:
-        good = np.flatnonzero(first.successful)
-        if good.size:
-            last = int(good[-1])
-            options["start"] = jtu.tree_map(lambda x: x[last, -1], first.sections)
-        try:
-            found[order[1]], ended = _finished(sweep, machine, **options | {"values": values[::-1]})
-        except KeyboardInterrupt:  # without any result to keep
-            ended = True
-
-    def table() -> Any:
-        each = [run.to_xarray(along="value").assign(direction=("value", [name] * run.values.size))
-                for name, run in found.items()]  # fmt: skip
-        return xr.concat(each, "value")
+def _sweep(machine: AbstractMachine, options: dict[str, Any], *, y: str | None = None) -> Found:
+    found, interrupted = _finished(sweep, machine, **options)
 
     def draw(figure: Figure) -> None:
-        ax = figure.subplots()
-        for name, run in found.items():
-            look = {"color": plot.BLUE, "ms": 6} if name == "up" else {"color": plot.RED, "ms": 3}
-            plot.plot_sweep(run, ax=ax, y=y, label=name, **look)
-        ax.legend(frameon=False)
+        plot.plot_sweep(found, ax=figure.subplots(), y=y, color=plot.BLUE)
 
-    good = any(bool(run.successful.any()) for run in found.values())
-    return Found([f"{name}: {run}" for name, run in found.items()], table, draw, good, ended)
+    good = bool(found.successful.any())
+    return Found([str(found)], lambda: found.to_xarray(along="value"), draw, good, interrupted)
 
 
 def _scan(machine: AbstractMachine, options: dict[str, Any]) -> Found:
@@ -332,7 +308,7 @@ def _continue(orbit: Any, options: dict[str, Any], *, y: str | None = None) -> F
 
 VERBS: Mapping[str, Verb] = {
     "simulate": Verb("one motion, cycle by cycle", simulate, _simulate),
-    "sweep": Verb("one number changed step by step", sweep, _sweep, ("up_and_down", "y")),
+    "sweep": Verb("one number changed step by step", sweep, _sweep, ("y",)),
     "scan": Verb("every combination of the values on the axes", scan, _scan),
     "basins": Verb("which start settles on which motion", basins, _basins),
     "orbit": Verb("a periodic motion", find_orbit, _orbit, ("settle",)),

@@ -11,7 +11,7 @@ from .base import (
 from .clocks import (
     Prepared, as_logged, at_section, clock_in_words, clock_word, convert_start, cycle_time,
     cycles_in_words, frequency_ratio, in_clock, in_cycle_clock, in_cycle_state, is_alive,
-    is_in_range, logged_turn, may_rest, phase_at, prepared, scales_known,
+    is_in_range, logged_turn, may_rest, observed_later, phase_at, prepared, scales_known,
 )
 from .contact_forces import contact_forces
 from .contacts import (

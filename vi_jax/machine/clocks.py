@@ -42,6 +42,12 @@ def at_section(machine: Machine, phase: Number) -> Machine:
 
 
 @singledispatch
+def observed_later(machine: Machine, since_section: Number) -> Machine | None:
+    """Return the same machine, observed so long after its section; `None` if that cannot move."""
+    return None
+
+
+@singledispatch
 def phase_at(machine: Machine, since_section: Number) -> Any:
     """Return the clock reading this long after the section; a crank angle need not begin at 0."""
     return since_section

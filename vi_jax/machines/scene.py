@@ -56,6 +56,7 @@ from ..machine import (
     like,
     logged_turn,
     may_rest,
+    observed_later,
     overridden,
     phase_at,
     scales_known,
@@ -375,6 +376,8 @@ class Scene(AbstractMachine):
         one, other = [stop.gap for stop in self.stops] if any(x is None for x in gaps) else gaps
         return one + other
 
+    sketched_at: ClassVar[float] = 0.3 * pi
+
     def sketch(self, pen: Any, state: State, phase: float) -> None:
         crank = self.crank
         size = pen.size = max(0.8, 0.25 * pen.reach)  # the crank has radius 1
@@ -455,6 +458,7 @@ def _scales_known(scene: Scene) -> bool:
 in_clock.register(Scene, Scene.in_clock)
 in_cycle_clock.register(Scene, lambda scene: scene.in_clock("phase"))
 at_section.register(Scene, Scene.at_section)
+observed_later.register(Scene, Scene.observed_later)
 phase_at.register(Scene, Scene.phase_at)
 convert_start.register(Scene, Scene.convert_start)
 in_cycle_state.register(Scene, Scene.in_cycle_state)

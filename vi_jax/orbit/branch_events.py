@@ -61,21 +61,11 @@ from .locate import SPACING, crossing, dip_of, passes_zero
 from .results import Orbit
 from .sliding import change_at, locate_change
 from .special import Point, further_of, point_at
-from .tolerances import ALIKE, BRIEF, LOCATED, ON_CIRCLE, ROUNDING, SAME
+from .tolerances import ALIKE, BRIEF, FAINT, LOCATED, NEARBY, ON_CIRCLE, ROUNDING, SAME
 from .walk import SAME_CURVE, Ending, Event, Table, bound_rows
 from .words import coincidence_in_words, grazing_in_words, place_in_words
 
 # These thresholds are choices; measured ones have the figure in the comment.
-
-# Events before the place where a branch begins are located on this share of the way.
-_SHORT = 0.999
-
-# A motion with this share of its neighbours' size is about to shrink to rest.
-_SHRINKS = 1e-2
-
-# The motion of half the period is sought if the halves differ by at most so many times `ALIKE`. The
-# corrector fails from four times on for a motion with twelve impacts in 32π.
-_ALMOST_ALIKE = 10.0
 
 # A branch ends at this multiple of its first duration; the steps are then as much longer. For a
 # rimless wheel near its homoclinic motion the multiplier is then correct to 2e-12.
@@ -89,10 +79,6 @@ _MOST_HALVINGS = 17
 
 # Most parabolas to find a dip of a test within a step: one, if the dip is a parabola. A choice.
 _MOST_PARABOLAS = 3
-
-# An extremum is a corner if the rate there exceeds this share of the rates on both sides: a choice,
-# far above the remainder at a place that is located to rounding.
-_CORNER = 1e-4
 
 Located = list[tuple[Point, Step]]
 
@@ -240,7 +226,7 @@ class MotionTable(Table):
                     at = self._crossing(here, at, FOLD)
                     point = self._point(kind, at, "the branch begins at a symmetric motion")
                 # Tests change sign twice there: locate earlier events from a point just before.
-                return Ending(at, kind, point, self._partway(here, at, _SHORT))
+                return Ending(at, kind, point, self._partway(here, at, 1 - ALIKE))
 
             product = lambda step, begin=begin, differ=differ: float(np.dot(begin, differ(step)))
             yield Event(product, ending)
@@ -254,7 +240,7 @@ class MotionTable(Table):
     def _find_origin(self, at: Step) -> tuple[Step, Point] | None:
         """Return the step where the branch begins at a motion of half the period, and that one."""
         size, start = np.linalg.norm(self._half_difference(at)), in_one_parameter(self.problem, at)
-        if size > _ALMOST_ALIKE * ALIKE:
+        if size > NEARBY:
             return None
         begins, half, step = locate_origin(*start)
         if size > ALIKE and begins is start[1]:
@@ -300,7 +286,7 @@ class MotionTable(Table):
                 sense, extreme = (1, "largest") if begin > 0 else (-1, "least")
                 # Otherwise it has a pole, as a multiplier at a grazing.
                 is_real = sense * value_at_zero >= max(sense * value, sense * other) - least
-                corner = ", with a corner" if abs(rate) > _CORNER * steep else ""
+                corner = ", with a corner" if abs(rate) > FAINT * steep else ""
                 detail = f"{name} = {value_at_zero:.10g} is the {extreme} nearby{corner}"
             if is_real:
                 yield self._point(kind, at, detail, quantity=name), at
@@ -429,7 +415,7 @@ class MotionTable(Table):
         if not self.problem.autonomous:
             return False
         size, *neighbours = (size_of_cycle(self.problem, step.x) for step in (at, here, last))
-        return size < _SHRINKS * max(neighbours)
+        return size < NEARBY * max(neighbours)
 
     def _begins_at(self, here: Step, at: Step) -> bool:
         """Return whether the branch begins there: halves of a period are equal, or images."""

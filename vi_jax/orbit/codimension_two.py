@@ -38,15 +38,11 @@ from .kinds import (
 from .local_map import LocalMap, graze_at
 from .locate import crossing, dip_of, locate_zero, passes_zero
 from .special import Point, point_at
-from .tolerances import ALIKE, LOCATED
+from .tolerances import ALIKE, FAINT, LOCATED
 from .touch import NoLocalMapError
 from .walk import SAME_CURVE
 
 # The thresholds here are choices.
-
-# A test that changes its sign without coming near to zero (as a share of its neighbours) has a
-# pole; for entries of the local map within this share. Entries this small are zero.
-_ENTRY = 1e-4
 
 # An impact slower than so many roots of a clearance is its turn, for accelerations of up to 50.
 _SAME_TURN = 10.0
@@ -150,7 +146,7 @@ def _resonant_grazings(
             step = locate_zero(problem, steps[i], steps[i + 1], test)
             if step is None or not bool(step.good):
                 continue
-            small = _ENTRY * max(abs(before), abs(after))
+            small = FAINT * max(abs(before), abs(after))
             at = local(step)
             if at and abs(resonance(at)) <= small and (at.passages(n) >= small).all():
                 yield _place(problem, i, steps, step), step, description

@@ -25,7 +25,7 @@ from .kinds import CROSSING, DOUBLING, FOLD, KINDS, REST, SLIDING, TORUS, TOUCHI
 from .rest import Chatter
 from .results import compound
 from .sliding import excess_rates
-from .tolerances import LOCATED
+from .tolerances import FAINT, LOCATED
 
 _SECTION = "section_"
 
@@ -80,10 +80,6 @@ def rates_at(
         return {name: quantity_at(problem, x, observed, name) for name in names}
 
     return jax.jvp(values, (x,), (direction,))
-
-
-# Multipliers are equal within this distance: a choice, far above their errors at a located point.
-_DOUBLE = 1e-4
 
 
 class AbstractCondition(eqx.Module):
@@ -215,16 +211,6 @@ def replacement_at(problem: Shooting, x: np.ndarray) -> Replacement | None:
     return Replacement(jnp.asarray(left[:, -1]), jnp.asarray(right[-1] * problem.scale[:-2]))
 
 
-class FixedComponent(AbstractCondition):
-    """The condition that the unknowns have a given component along a row."""
-
-    row: Float[Array, " unknowns"]
-    value: Scalar
-
-    def residual(self, problem, x, observed, begins):
-        return self.row @ x - self.value
-
-
 class Special(AbstractCondition):
     """The condition that a motion is special.
 
@@ -305,8 +291,8 @@ def is_defective(problem: Shooting, step: Step, multiplier: float) -> bool:
 
     sizes, M = np.asarray(problem.sizes)[1:], step.observed.monodromy
     matrix = M * sizes / sizes[:, None]
-    is_equal = lambda value: abs(value - multiplier) <= _DOUBLE
+    is_equal = lambda value: abs(value - multiplier) <= FAINT
     # Only the part of the matrix in the plane of both counts: near a grazing the others are large.
     found: Any = schur(matrix, output="complex", sort=is_equal)
     triangle, _, equal = found
-    return bool(equal < 2 or abs(triangle[0, 1]) > _DOUBLE)
+    return bool(equal < 2 or abs(triangle[0, 1]) > FAINT)

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -61,18 +61,6 @@ def special_table(special: list[Point], names: tuple[str, ...]) -> dict[str, Any
     for i, name in enumerate(names):
         found.setdefault(name, np.array([point.parameters[i] for point in special], float))
     return {f"special_{name}": ("special", x) for name, x in found.items()}
-
-
-def _numbers(found: object) -> dict[str, np.ndarray]:
-    named = found if isinstance(found, Mapping) else {"value": found}
-    numbers = {str(name): np.asarray(x) for name, x in named.items()}
-    for name, x in numbers.items():
-        if x.dtype.kind not in "biufc":
-            raise TypeError(
-                "Argument `function` must return a number, or numbers by name, but its "
-                f"{name!r} is {named[name]!r}."
-            )
-    return numbers
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
@@ -252,40 +240,6 @@ class Curve(abc.ABC):
             return (self.averages | self.free)[name]
         inner = name.removeprefix("section_")
         return getattr(self, name) if inner == name else self.sections[inner]
-
-    def table(self, function: Callable[[Orbit], Any]) -> "xr.Dataset":
-        """Return an `xarray.Dataset` of a function of the orbit at each point, with the parameter.
-
-        **Arguments:** a function of an `Orbit` that returns numbers by name, or one number or
-        array, which is then called `value`. An array adds axes. `.to_dataframe()` makes a table.
-
-        **Raises:** `TypeError` if the function returns no numbers, or different ones at a point.
-        """
-        if not callable(function):
-            raise TypeError(
-                f"Argument `function` must be a function of an `Orbit`, but got {function!r}."
-            )
-        rows = [_numbers(function(self.orbit(i))) for i in range(len(self.steps))]
-        shapes = {name: x.shape for name, x in rows[0].items()}
-        for i, row in enumerate(rows):
-            shapes_here = {name: x.shape for name, x in row.items()}
-            if shapes_here != shapes:
-                raise TypeError(
-                    "Argument `function` must return numbers of the same names and shapes at each "
-                    f"point, but gave {shapes} at point 0 and {shapes_here} at point {i}."
-                )
-        if "parameter" in shapes:
-            raise TypeError(
-                "Argument `function` must not return `parameter`, which is a column of the branch."
-            )
-        first = self.names[0]
-        data: dict[str, Any] = {name: ("point", self.parameter) for name in (first, "parameter")}
-        for name, shape in shapes.items():
-            axes = (f"{name}_{k}" for k in range(len(shape)))
-            data[name] = ("point", *axes), np.stack([row[name] for row in rows])
-        quantities = {name: name for name in (*shapes, first)} | {"parameter": first}
-        table = xr.Dataset(data, attrs={"parameter": first})
-        return with_units(table, units_of(self.problem.machine), quantities)
 
     def orbit(self, index: int) -> Orbit:
         """Return the motion at one point; a negative `index` counts from the end."""

@@ -22,13 +22,14 @@ from ..machine import (
     without_modes,
 )
 from .results import Orbit, distance
+from .tolerances import SAME
 
 # The pieces of polynomials of degree 7 for a chain's history: a choice, far more accurate than it.
 _PIECES, _ROOM = 64, 1025
 
-# A run of a stable motion ends when differences at its start are this share of themselves, after
-# at most so many periods more. Choices.
-_FORGOTTEN, _MOST_PERIODS = 1e-7, 400
+# A run of a stable motion ends when differences at its start are the share `SAME` of themselves,
+# after at most so many periods more: a choice.
+_MOST_PERIODS = 400
 
 
 def as_chain(machine: AbstractMachine, guess: Any) -> tuple[AbstractMachine, Any]:
@@ -61,7 +62,7 @@ def with_delay_error(orbit: Orbit) -> Orbit:
     largest = float(jnp.max(jnp.abs(orbit.multipliers)))
     periods = 1 + int(np.ceil(float(longest_delay(machine)) / float(orbit.duration)))
     if largest < 1:
-        periods += int(min(np.log(_FORGOTTEN) / np.log(max(largest, 1e-3)), _MOST_PERIODS))
+        periods += int(min(np.log(SAME) / np.log(max(largest, 1e-3)), _MOST_PERIODS))
     own = chain._past.own(state)
     start = HybridState(own, modes_of(orbit.state) or (), history)
     run = simulate(machine, start, periods * cycles, method=orbit.method, record="sections")

@@ -45,13 +45,13 @@ from ..machine import (
     is_autonomous,
     modes_of,
     nearest_images,
+    observed_later,
     phase_at,
     raveled,
     replaced,
     with_modes,
     without_modes,
 )
-from ..machines import Scene
 from .cycle_map import CycleMap, axes_of, batch_together, cycle_map, forward_jacobian, map_state
 from .delay import as_chain, with_delay_error
 from .results import ORBIT_RESULTS, Orbit, distance, multipliers_of, trimmed
@@ -172,13 +172,12 @@ def move_section(
     section is put where the guess's motion is farthest from its impacts, if it can be moved.
     """
     machine = the_map.machine
-    if not isinstance(machine, Scene):
+    here = observed_later(machine, jnp.zeros(()))
+    if here is None:
         return the_map, guess, jnp.zeros((), jnp.int32)
     if shared:
         # With a section phase, also of 0, the guess and the orbit have one program.
-        phase = jnp.zeros(()) if machine.section_phase is None else machine.section_phase
-        at_phase = dataclasses.replace(the_map, machine=machine.at_section(phase))
-        run, _ = _with_jacobians(at_phase, guess, impact_log)
+        run, _ = _with_jacobians(dataclasses.replace(the_map, machine=here), guess, impact_log)
     else:
         run = _run(the_map, guess, impact_log, simulate)
     assert run.samples is not None and run.impact_log is not None
@@ -191,7 +190,7 @@ def move_section(
     failed = ~jnp.all(jnp.isfinite(in_rows(without_modes(start), 0)))
     place = jnp.where(failed, 0, place)
     start = jtu.tree_map(lambda a, b: jnp.where(failed, a, b), guess, start)
-    moved = machine.observed_later(jnp.asarray(step, phase.dtype) * place)
+    moved = observed_later(machine, jnp.asarray(step, phase.dtype) * place)
     return dataclasses.replace(the_map, machine=moved), start, place
 
 

@@ -6,20 +6,21 @@ import numpy as np
 
 from ..flow import NamedEnumeration
 from .local_map import LocalMap
+from .tolerances import SAME
 
 # Longest period that is sought, and the number of iterates in which it is sought.
 LONGEST, SOUGHT = 64, 192
 
 # A motion is periodic if it repeats within this share of one kick: a choice, far above the rest of
-# the transient (`_REMAINING`) and far below the differences of chaos. A distant one is periodic
+# the transient (`SAME`) and far below the differences of chaos. A distant one is periodic
 # within the square of it.
 REPEATS = 1e-3
 
 # A motion beyond so many kicks does not return: a choice.
 _LOST = 1e9
 
-# Share of the slowest transient that remains after settling; bounds of the iterates for it.
-_REMAINING, _FEWEST, _MOST = 1e-7, 400, 6000
+# Bounds of the iterates in which the slowest transient settles to the share `SAME`.
+_FEWEST, _MOST = 400, 6000
 
 # An attractor shrinks towards the grazing if its depth is at most this multiple of a first impact's
 # (in trials a chain of impacts within a small attractor reached half of it). Its test uses so many
@@ -86,7 +87,7 @@ def transient_length(local: LocalMap) -> int:
     slowest = np.abs(np.linalg.eigvals(local.matrix)).max()
     if slowest <= 0 or slowest >= 1:
         return _FEWEST if slowest <= 0 else _MOST
-    return int(np.clip(np.log(_REMAINING) / np.log(slowest), _FEWEST, _MOST))
+    return int(np.clip(np.log(SAME) / np.log(slowest), _FEWEST, _MOST))
 
 
 def kick_sizes(local: LocalMap, offsets: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ simulated at some of these values.
 
 import dataclasses
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from .._checks import count, flag, instance_of
-from .._messages import Interrupted, at_work, count_of
+from .._messages import at_work, count_of
 from ..flow import simulate
 from ..machine import Stated, Summarized, in_rows, in_unit, stated, stops_of
 from .corrector import method_of_runs, on_host
@@ -347,10 +347,8 @@ def grazing(
     if not check:
         return unchecked
     offsets = unchecked.forecast.offset[::SIMULATE_EVERY]
-    with at_work(
-        "grazing", lambda: Interrupted("check of the grazing", unchecked),
-        progress=progress, unit="value", total=len(offsets),
-    ) as report:  # fmt: skip
+    bar: Any = {"progress": progress, "unit": "value", "total": len(offsets)}
+    with at_work("check of the grazing", lambda: unchecked, **bar) as report:
         subset = jax.tree.map(lambda a: a[::SIMULATE_EVERY], attractors)
         by_machine, agree, far = compare_with_machine(graze, offsets, subset)
         checked, agreement = agreeing_range(np.abs(offsets), *agree)

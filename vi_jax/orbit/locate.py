@@ -10,7 +10,7 @@ import numpy as np
 
 from .corrector import Step, advance, distance_along, observe
 from .equations import Shooting
-from .tolerances import ROUGHLY
+from .tolerances import NEARBY, ROUGHLY
 
 # Distances, as shares of the step, to retry before a place without a solution: choices.
 _RETRIES = (1e-6, 1e-5, 1e-4, 1e-3)
@@ -32,9 +32,6 @@ MOST_SAMPLES = 8
 # A neighbour lies on the crossing curve if its tangent deviates from the median by more than this
 # multiple of the median deviation. A choice: equal distances give 3 at most.
 _OUTLIER = 10.0
-
-# A zero near a solution is at most this far from it (in the parameter's scale): a choice.
-_CLOSE = 1e-2
 
 
 class NoValueError(ArithmeticError):
@@ -168,7 +165,7 @@ def find_zero_near(problem: Shooting, x: np.ndarray, test: Callable[[Step], floa
         shift, report = newton(  # pyright: ignore[reportAssignmentType]
             value, 0.0, x1=1e-6, tol=1e-12, full_output=True, disp=False
         )
-        is_near = report.converged and abs(shift) < _CLOSE and not np.isnan(value(float(shift)))
+        is_near = report.converged and abs(shift) < NEARBY and not np.isnan(value(float(shift)))
     except NoValueError:
         return None
     return found[-1] if is_near else None

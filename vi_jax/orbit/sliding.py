@@ -34,12 +34,7 @@ from .equations import Leg, Shooting
 from .flight import Event, Flight
 from .kinds import ADDING_SLIDING, CROSSING_SLIDING, GRAZING_SLIDING, SWITCHING_SLIDING
 from .locate import find_zero_near
-from .tolerances import LOCATED, ROUGHLY
-
-# A part of a motion vanishes if it is shorter than the first share of the period. The second share
-# is used if nothing else is found, as a corrector may not get closer. Choices: special points are
-# located far closer (see `locate_change`).
-_BRIEF, _NEARLY_BRIEF = 1e-4, 1e-2
+from .tolerances import FAINT, LOCATED, NEARBY, ROUGHLY
 
 
 class Change(NamedTuple):
@@ -73,10 +68,10 @@ def change_at(problem: Shooting, at: Step) -> Change | None:
     if not problem.modes[0]:
         return None
     found = (
-        _vanishing_part(problem, at, _BRIEF)
+        _vanishing_part(problem, at, FAINT)
         or _touching_part(problem, at)
         or _change_at_event(problem, at)
-        or _vanishing_part(problem, at, _NEARLY_BRIEF)
+        or _vanishing_part(problem, at, NEARBY)  # a corrector may not get closer
     )
     return found if found is not None and found.kind is not None else None
 

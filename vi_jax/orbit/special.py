@@ -98,7 +98,7 @@ class Point:
 
     def switch(self, to: str | None = None, *, distance: float = 0.01) -> Any:
         """Return the start of another curve that begins here: an `Orbit` to be continued, or on a
-        boundary mostly a `Point` that `boundary` follows in the same two parameters.
+        boundary a `Point` that `boundary` follows in the same two parameters.
 
         On a branch: at a period doubling the motion of twice the period, or of half of it if the
         branch begins at one; at a Neimark–Sacker point a `Torus` (for `continue_torus`), which has
@@ -114,8 +114,7 @@ class Point:
         Neimark–Sacker points, or from that the curve of folds or doublings; at a fold or doubling
         that grazes the curve of grazings, and back; where a motion that grazes becomes symmetric
         the curve of symmetry breakings; at a resonant grazing the curve of folds or doublings of
-        the motion with one impact; at a resonance 1:3 or 1:4 an orbit of three or four periods,
-        with other parameters.
+        the motion with one impact.
 
         **Arguments:**
 

@@ -14,7 +14,7 @@ from .._types import State
 from ..flow import simulate
 from ..machine import after_event, others_of, with_leaf
 from .codimension_two import PERIODS
-from .conditions import AbstractCondition, FixedComponent, Special, bifurcation_tests
+from .conditions import Special, bifurcation_tests
 from .corrector import (
     Step,
     advance,
@@ -38,8 +38,6 @@ from .kinds import (
     GRAZING,
     RESONANCE_1,
     RESONANCE_2,
-    RESONANCE_3,
-    RESONANCE_4,
     RESONANT,
     REST,
     SLIDING,
@@ -67,21 +65,16 @@ def _orbit_at(problem: Shooting, step: Step, what: str, distance: float) -> Orbi
     return orbit_of(problem, step)
 
 
-def _repeat_motion(point: Point, n: int) -> tuple[Shooting, np.ndarray, np.ndarray]:
-    """Return the motion gone through n times, and right singular vectors of its Jacobian in x."""
-    new = over_periods(point.problem, n)
-    x = repeated(point.problem, point.step.x, new)
-    return new, x, np.linalg.svd(jacobian_at(new, x)[:, :-1])[2]
-
-
 def _doubled_orbit(point: Point, distance: float) -> Orbit:
     """Return a motion of twice the period, or of half of it if the branch begins at one."""
     if point.is_origin:
         problem, x = point.problem, point.step.x
         step = advance(problem, x, tangent_at(problem, x), distance)
         return _orbit_at(problem, step, "half the period", distance)
-    new, x, vectors = _repeat_motion(point, 2)
-    step = advance(new, x, np.append(vectors[-1], 0.0), distance)
+    new = over_periods(point.problem, 2)
+    x = repeated(point.problem, point.step.x, new)
+    null = np.linalg.svd(jacobian_at(new, x)[:, :-1])[2][-1]
+    step = advance(new, x, np.append(null, 0.0), distance)
     return _orbit_at(new, step, "twice the period", distance)
 
 
@@ -249,7 +242,7 @@ def _as_kind(kind: str, point: Point, distance: float) -> Point:
 
 
 def _in_two_parameters(
-    point: Point, problem: Shooting, x: np.ndarray, condition: AbstractCondition
+    point: Point, problem: Shooting, x: np.ndarray, condition: Special
 ) -> tuple[Shooting, np.ndarray]:
     ((name, (value, size)),) = point.further.items()
     problem_two = dataclasses.replace(
@@ -257,21 +250,6 @@ def _in_two_parameters(
         widths=jnp.insert(problem.widths, 0, size),
     )  # fmt: skip
     return problem_two, np.insert(x, -1, value)
-
-
-def _orbit_of_periods(n: int, point: Point, distance: float) -> Orbit:
-    """Return a motion of n periods near one with multipliers exp(±2πi/n).
-
-    The derivative of n periods is the identity in a plane. Each direction in it leads to such
-    motions, at some values of both parameters.
-    """
-    new, x, vectors = _repeat_motion(point, n)
-    second, first = (np.append(vector, [0.0, 0.0]) for vector in vectors[-2:])
-    row = first[:-1] / new.scale
-    condition = FixedComponent(jnp.asarray(np.append(row, 0.0)), jnp.asarray(row @ x + distance))
-    two, begin = _in_two_parameters(point, new, x, condition)
-    step = advance(two, begin + distance * first * two.scale, second, 0.0)
-    return _orbit_at(two, step, f"{n} times the period", distance)
 
 
 # The first step along a curve is this share of the distance; each further one is twice as long, so
@@ -349,7 +327,5 @@ starts |= {
             (GRAZING, FOLD, FOLD), (GRAZING, DOUBLING, DOUBLING), (GRAZING, SYMMETRY, SYMMETRY),
         )
     },
-    (TORUS, RESONANCE_3): {_ORBIT: partial(_orbit_of_periods, 3)},
-    (TORUS, RESONANCE_4): {_ORBIT: partial(_orbit_of_periods, 4)},
     (GRAZING, RESONANT): {to: partial(_point_near_resonance, to) for to in (FOLD, DOUBLING)},
 }  # fmt: skip

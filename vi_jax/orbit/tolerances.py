@@ -35,5 +35,13 @@ SAME = 1e-7
 # values (5e-4 and 1e-3 were met).
 ALIKE = 1e-3
 
+# Shares far above what the corrector leaves at a located place and below what differs. The first:
+# multipliers are equal, an entry of a local map is zero, an extremum is no corner, events coincide,
+# a part of the period vanishes. The second: solutions are near enough to search for one from the
+# other, their tangents are the same, a motion is about to shrink to rest; for both halves of a
+# period near a doubling: with twelve impacts in 32π the corrector fails from four times `ALIKE` on.
+# Choices.
+FAINT, NEARBY = 1e-4, 1e-2
+
 # Most events of a cycle that are listed, with hops, switches and sections: a choice.
 LISTED = 32

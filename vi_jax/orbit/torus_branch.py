@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import count, flag, interval
-from .._messages import Interrupted, ReportProgress, at_work
+from .._messages import ReportProgress, at_work
 from ..machine import check_leaf, in_unit, leaf, units_of
 from .find import find_orbit
 from .from_orbit import check_parameter
@@ -200,10 +200,7 @@ def continue_torus(
             (equations, points, most),
         )  # fmt: skip
 
-    def interrupted() -> Interrupted:
-        return Interrupted("walk along the tori", result())
-
-    with at_work("tori", interrupted, progress=progress, unit="torus") as report:
+    with at_work("walk along the tori", result, progress=progress, unit="torus") as report:
         for walk in walks:
             walk.walk(report, **settings)
     return result()

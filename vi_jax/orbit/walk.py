@@ -17,7 +17,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._checks import count, from_host, given_number
-from .._messages import Interrupted, ReportProgress, at_work, warn
+from .._messages import ReportProgress, at_work, warn
 from .._types import Vector
 from ..machine import nearest_images
 from .corrector import Step, advance, distance_along, on_host, step_error, steps_depend_on_motion
@@ -26,7 +26,7 @@ from .equations import Shooting
 from .from_orbit import COARSE, with_finer_steps, with_grown_sizes
 from .locate import locate_zero
 from .special import Point
-from .tolerances import EXACT, LOCATED, ROUGHLY, SAME
+from .tolerances import EXACT, FAINT, LOCATED, NEARBY, ROUGHLY, SAME
 
 # Reasons to end of every curve: Ctrl-C was pressed, the corrector fails, the curve closes, a bound.
 INTERRUPTED, STALLED, CLOSED, BOUNDS = "interrupted", "stalled", "closed", "bounds"
@@ -48,9 +48,9 @@ _SHORTEST = 1e-6
 # After a cut, this many steps keep their length before it grows again.
 _STEADY = 3
 
-# Events within the first share of the way before a place coincide with it. An earlier event's test
-# must be below minus the second share of its first value: above errors near singular equations.
-_SHORT, _NOISE = 1e-4, 1e-3
+# An earlier event's test must be below minus this share of its first value: above errors near
+# singular equations.
+_NOISE = 1e-3
 
 # A curve begins at the zero of a test that is at most this share of its value a step further on.
 _ZERO_AT_START = 1e-7
@@ -176,10 +176,8 @@ def follow_both_ways(
             ends=(back.end, ahead.end), special=special,
         )  # fmt: skip
 
-    def interrupted() -> Interrupted:
-        return Interrupted(f"walk along the {what}", make_result())
-
-    with at_work(what, interrupted, progress=progress, unit="point") as report:
+    walk = f"walk along the {what}"
+    with at_work(walk, make_result, progress=progress, unit="point") as report:
         ahead.end = ahead.walk(report, **settings)
         back.end = CLOSED if ahead.end == CLOSED else back.walk(report, **settings)
     return make_result()
@@ -266,7 +264,7 @@ class _Walk:
                 continue
             # Later events, and those that coincide with the first one, are not located.
             first = ending
-            length = (1 - _SHORT) * distance_along(self.table.problem, here, first.last)
+            length = (1 - FAINT) * distance_along(self.table.problem, here, first.last)
             end = self.table.advance(here.x, here.tangent, length)
             if first.reason == SHORTER or not bool(end.good):
                 return first
@@ -351,10 +349,6 @@ def bound_rows(table: Table) -> list[Event]:
     return [row(i, *end) for i, (low, high) in intervals for end in ((low, 1.0), (high, -1.0))]
 
 
-# Two solutions are the same motion (`SAME`) if their tangents, too, differ by less than this: a
-# choice.
-_SAME_TANGENT = 1e-2
-
 # A curve is away from its first point beyond so many lengths of its step, else near it: a choice.
 _NEAR = 2.0
 
@@ -407,7 +401,7 @@ class Closing:
 
             def ending(at: Step, start=start, tangent=tangent, point=point) -> Ending | None:
                 same = self._distance(at, start) < SAME
-                if not same or np.linalg.norm(at.tangent - tangent) >= _SAME_TANGENT:
+                if not same or np.linalg.norm(at.tangent - tangent) >= NEARBY:
                     return None
                 return Ending(at if point is None else point._replace(tangent=at.tangent), CLOSED)
 

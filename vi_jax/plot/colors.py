@@ -95,6 +95,11 @@ def mark_style(kind: str) -> dict[str, Any]:
     return {"marker": marker, "mfc": fill, "mec": "k", "mew": 0.8, "ms": size, "ls": "none"}
 
 
+def draw_mark(ax: Axes, kind: str, x: Any, y: Any) -> None:
+    """Draw a special point, with its kind once in the legend."""
+    ax.plot(x, y, **{**mark_style(kind), "zorder": 4, "label": once(ax, kind)})
+
+
 def once(ax: Axes, label: str) -> str | None:
     """Return the label, or `None` if the axes have it already."""
     return None if label in ax.get_legend_handles_labels()[1] else label

@@ -86,10 +86,7 @@ def motion_path(
     instance_of("motion", motion, (Run, Samples), "a `Run`, from `simulate`, or its `samples`")
     if machine is not None:
         instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
-    coordinate = coordinate_of(machine, coordinate)
-    samples = motion.samples if isinstance(motion, Run) else motion
-    if samples is None:
-        raise ValueError("Argument `motion` must have samples. Simulate with `samples=64`.")
+    coordinate, samples = coordinate_of(machine, coordinate), samples_of(motion)
     cycles = np.asarray(samples.cycles, float)
     if cycles.ndim != 1:
         raise ValueError(
@@ -114,6 +111,14 @@ def motion_path(
     return path
 
 
+def samples_of(motion: Run | Samples) -> Samples:
+    """Return the samples of a motion. **Raises:** `ValueError` for a run without any."""
+    samples = motion.samples if isinstance(motion, Run) else motion
+    if samples is None:
+        raise ValueError("Argument `motion` must have samples. Simulate with `samples=64`.")
+    return samples
+
+
 def drawn_path(
     motion: Run | Samples, *, machine: AbstractMachine | None, **about: Any
 ) -> MotionPath:
@@ -131,8 +136,7 @@ def drawn_path(
 
 def turns(motion: Run | Samples, machine: AbstractMachine, coordinate: int | str) -> bool:
     """Return whether a coordinate is an angle of `wrap_angles` or `turn_of`."""
-    samples = motion.samples if isinstance(motion, Run) else motion
-    assert samples is not None
+    samples = samples_of(motion)
     Y = _coordinate_path(machine, coordinate_of(machine, coordinate), samples.state)[0]
     counter = counter_of(machine)
     turn = counter.name if isinstance(counter, Turn) else None
@@ -238,9 +242,7 @@ def plot_history(
     - `style`: options of `Axes.plot`.
     """
     path = drawn_path(motion, machine=machine, window=window, coordinate=coordinate)
-    turning = counts_by_angle(machine)
-    samples = motion.samples if isinstance(motion, Run) else motion
-    assert samples is not None
+    turning, samples = counts_by_angle(machine), samples_of(motion)
     if unit is None:
         unit = "angle" if turning else "time" if _without_drive(machine, samples) else "cycles"
     one_of("unit", unit, ("angle", "cycles", "time"))
@@ -340,8 +342,7 @@ def plot_phase_portrait(
     ax = new_axes(ax)
     (line,) = ax.plot(path.Y, path.V, **{"color": BLUE, "lw": thick(1.0), **style})
     if sections:
-        unlogged = motion.samples if isinstance(motion, Run) else motion  # without the impacts
-        assert unlogged is not None
+        unlogged = samples_of(motion)  # without the impacts
         samples = drawn_path(unlogged, machine=machine, window=window, coordinate=coordinate)
         whole = abs(samples.cycles - samples.cycles.round()) < 1e-9
         dots = {"ms": 4, "color": line.get_color(), "zorder": 3, "label": once(ax, "section")}

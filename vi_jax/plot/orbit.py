@@ -32,7 +32,7 @@ from ..orbit import (
 )
 from ..robust import Manifold
 from ..scans import REGIMES, Sweep
-from .colors import BLUE, DASHES, IRREGULAR, RED, color_of, mark_style, once, thick
+from .colors import BLUE, DASHES, IRREGULAR, RED, color_of, draw_mark, once, thick
 from .motion import new_axes
 
 # Names of lines in a legend, and the order of dots: above lines and below marks.
@@ -99,8 +99,7 @@ def plot_branch(
         if drawn:
             ax.plot([], [], line, color="0.3", lw=look["lw"], label=once(ax, word))
     for point in branch.special if special else ():
-        mark = {**mark_style(point.kind), "zorder": 4, "label": once(ax, point.kind)}
-        ax.plot(across[point.index], up[point.index], **mark)
+        draw_mark(ax, point.kind, across[point.index], up[point.index])
     if legend:
         _legend(ax)
     machine = branch.problem.machine
@@ -198,8 +197,7 @@ def plot_boundary(
     color = color_of(curve.problem.cycles, curve.impact_speed.shape[1])
     ax.plot(*curve.parameters.T, **{"color": color, **look, **style})
     for point in curve.special if special else ():
-        mark = {**mark_style(point.kind), "zorder": 4, "label": once(ax, point.kind)}
-        ax.plot(*point.parameters, **mark)
+        draw_mark(ax, point.kind, *point.parameters)
     if legend:
         _legend(ax)
     units = units_of(curve.problem.machine)
@@ -326,7 +324,7 @@ def plot_grazing(
     if (period == 0).any():
         chaos = IRREGULAR[REGIMES.chaotic]
         ax.plot([], [], ".", color=chaos, label="forecast: no period")
-    ax.plot(0.0, 0.0, **{**mark_style("grazing"), "label": "grazing", "zorder": 4})
+    draw_mark(ax, "grazing", 0.0, 0.0)
     ax.set_xscale("function", functions=(_root, lambda x: x * np.abs(x)))
     farthest = found.forecast.offset[np.argmax(np.abs(found.forecast.offset))]
     ax.plot([farthest, 0.0], [0.0, 0.0], ls="none")  # for the axis if nothing is drawn

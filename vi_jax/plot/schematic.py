@@ -1,6 +1,5 @@
 """Schematics of machines: each part is drawn at its position, in the field's conventions."""
 
-from math import pi
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,6 @@ from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
 from .._checks import instance_of
 from .._types import State
 from ..machine import AbstractMachine, SoftStop, convert_start
-from ..machines import Scene
 from .colors import BLUE, GREEN, RED
 from .motion import all_stops, new_axes
 
@@ -194,8 +192,8 @@ def plot_sketch(
     """
     instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
     state = machine.start() if state is None else convert_start(machine, state)
-    if phase is None:  # a crank or a rotor, turned
-        phase = 0.3 * pi if isinstance(machine, Scene) else 0.0
+    if phase is None:
+        phase = getattr(machine, "sketched_at", 0.0)
     ax = new_axes(ax)
     sketch(machine, pen_for(machine, ax, _positions(machine, state), labels=True), state, phase)
     ax.set_aspect("equal", adjustable="datalim")

@@ -9,7 +9,7 @@ from .._checks import instance_of, one_of
 from ..flow import Run
 from ..machine import components, in_brackets, unit_of, units_of, without_modes
 from ..orbit import KINDS, Torus, TorusBranch
-from .colors import BLUE, ORANGE, mark_style, once, thick
+from .colors import BLUE, ORANGE, draw_mark, once, thick
 from .motion import new_axes
 from .orbit import axis_name
 
@@ -72,8 +72,7 @@ def _draw_family(family: TorusBranch, ax: Axes, name: str, style: dict[str, Any]
     for end, i in zip(family.ends, (0, -1), strict=True):
         if end in KINDS:
             for value in np.atleast_1d(values[i]):
-                mark = {**mark_style(end), "zorder": 4, "label": once(ax, end)}
-                ax.plot(family.parameter[i], value, **mark)
+                draw_mark(ax, end, family.parameter[i], value)
     ax.set_xlabel(axis_name(family.name, units_of(family.tori[0].machine)))
     words = {"rotation": "rotation number ρ", "exponents": "exponents (1/cycle)"}
     ax.set_ylabel(words.get(name, name.replace("_", " ")))

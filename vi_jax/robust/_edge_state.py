@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import count, flag
-from .._messages import Interrupted, ReportProgress, at_work, silent
+from .._messages import ReportProgress, at_work, silent
 from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, in_rows, without_modes
@@ -125,14 +125,8 @@ def edge_state(
             )
     section_states: list[Rows] = []
 
-    def kept() -> Interrupted | None:
-        return (
-            Interrupted("edge", _described(settling, section_states, None))
-            if section_states
-            else None
-        )
-
-    with at_work("edge", kept, progress=progress, unit="round", total=rounds) as report:
+    found = lambda: _described(settling, section_states, None) if section_states else None
+    with at_work("edge", found, progress=progress, unit="round", total=rounds) as report:
         return track_edge(settling, start, outside_row, longest, rounds, section_states, report)
 
 

@@ -8,15 +8,11 @@ import numpy as np
 from jaxtyping import Bool
 
 from .._checks import flag, given_number, one_of
-from .._messages import Interrupted, at_work
+from .._messages import at_work
 from .._types import State
 from ..machine import AbstractMachine, Summarized, in_rows, is_autonomous, without_modes
 from ..orbit import Orbit, cycle_map
-from ._settling import Row, Rows, Settling, in_row, one_orbit
-
-# Distance from the saddle, relative to its size, at which its manifolds are taken to be straight.
-# They deviate from their tangents by the square of it. A choice.
-_BEGIN = 1e-5
+from ._settling import NEAR, SAME, Row, Rows, Settling, in_row, one_orbit
 
 # The largest angle, in radians, of a curve's turn from point to point; the share of `spacing` to
 # which points are set closer for a smaller turn. Choices.
@@ -29,9 +25,6 @@ _ARC, _HALF, _ROUNDS, _WIDER = 64, 2.9, 6, 0.25
 # Distance of the images of neighbours on an arc; largest distance of an image from the saddle; most
 # growth of a difference until then. Choices.
 _REACH, _FAR, _GROWTH = 0.1, 0.2, 1e6
-
-# An unstable manifold has ended if a period adds less than this part of `spacing`. A choice.
-_ENDED = 1e-3
 
 # Two neighbours closer than this share of a period's stretch of an unstable manifold are on both
 # sides of a jump; most points of a stretch. Choices.
@@ -120,10 +113,8 @@ def manifold(
         first, second = (jax.vmap(saddle.map.state)(saddle.states(part)) for part in parts)
         return Manifold(orbit, which, (first, second), (lengths[0], lengths[1]), orbit.machine)
 
-    def kept() -> Interrupted | None:
-        return Interrupted("manifold", result()) if any(lengths) else None
-
-    with at_work("manifold", kept, progress=progress, unit="point") as report:
+    found = lambda: result() if any(lengths) else None
+    with at_work("manifold", found, progress=progress, unit="point") as report:
         for i, side in enumerate((1.0, -1.0)):
             for rows, lengths[i] in grow(saddle, side, length, spacing):
                 parts[i].append(rows)
@@ -216,7 +207,8 @@ def _next_point(saddle: _Saddle, point: Row, direction: Row, size: float) -> Row
 
 def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
     """Yield one branch of an unstable manifold, with NaN rows at jumps."""
-    begin = side * _BEGIN * saddle.unstable
+    # As far as it is straight: it deviates from its tangent by the square of this distance.
+    begin = side * SAME * saddle.unstable
     reached, periods = 0.0, 0
     while reached < length and periods < 400:
         periods += 1
@@ -227,7 +219,7 @@ def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pi
         arc_length = reached + np.concatenate([[0.0], np.cumsum(steps)])
         used = int(np.searchsorted(arc_length, length)) + 1
         cut = np.flatnonzero(~connected[: used - 1])
-        if arc_length[-1] - reached < _ENDED * spacing and reached > spacing:
+        if arc_length[-1] - reached < NEAR * spacing and reached > spacing:
             break  # it has reached an attractor
         reached = float(min(arc_length[-1], length))
         yield np.insert(rows[:used], cut + 1, np.nan, axis=0), reached

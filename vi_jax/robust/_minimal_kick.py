@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .._checks import count, flag, given_number, interval
-from .._messages import Interrupted, at_work
+from .._messages import at_work
 from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, components, in_rows, state_in_words, units_of
@@ -41,8 +41,9 @@ _BITS, _COARSE = 3, 7
 # Rounds that leave nothing between two numbers of double precision.
 _ALL_BITS = math.ceil(np.finfo(float).nmant / _BITS)
 
-# The rays grow to twice the length until one leaves, at most so many times.
-_DOUBLINGS = 12
+# Most doublings of the rays until one leaves; most additional periods, and Newton steps for each.
+# Choices.
+_MOST = 12
 
 # Directions around the best, per dimension; a round narrows them by this factor. Choices.
 AROUND, NARROWER = 12, 3.0
@@ -151,7 +152,7 @@ def first_exits(
         sizes = (settling.motion.sizes + np.abs(kick.start))[list(kick.places)]
         reach = float(np.max(kick.weights * sizes)) / 4
     found = exits(settling, kick, rays, 0.0, reach, points)
-    for _ in range(_DOUBLINGS if largest is None else 0):
+    for _ in range(_MOST if largest is None else 0):
         if np.isfinite(found.outside).any():
             break
         reach *= 2
@@ -228,9 +229,6 @@ _NEAR_SADDLE = 0.05
 # before: adaptive steps of 1e-11 leave some 1e-9 in a gradient. The kick is then final. A choice.
 _NOISE = 1e-7
 
-# Most additional periods, and Newton steps for each: choices.
-_PERIODS, _STEPS = 12, 12
-
 # Size of the differences of gradients, relative to the norm of the kick; and the longest step.
 _DIFFERENCE, _STEP = 1e-5, 0.2
 
@@ -265,7 +263,7 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
         return offsets @ normals[place], slope / kick.weights
 
     first, before, last = z, None, np.inf
-    for added in range(_PERIODS):
+    for added in range(_MOST):
         found = _newton(functools.partial(edge, cycles=int(near[0]) + 1 + added * period), z)
         if found is None or np.linalg.norm(found[0] - first) > _FARTHEST * np.linalg.norm(first):
             return before
@@ -302,7 +300,7 @@ def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
 def _newton(edge: Callable[[Kicks], tuple[Row, Kicks]], z: Row) -> tuple[Row, float] | None:
     """Solve as `shortest` does; `edge` returns g and its gradient at some kicks."""
     size, multiplier, last = z.size, None, np.inf
-    for _ in range(_STEPS):
+    for _ in range(_MOST):
         step = _DIFFERENCE * np.linalg.norm(z)
         offsets = step * np.eye(size)
         values, slopes = edge(np.concatenate([z[None], z + offsets, z - offsets]))
@@ -474,18 +472,16 @@ def minimal_kick(
     kick = _kick_of(settling, start, components, weights or {}, bounds or {})
     kicks: list[MinimalKick] = []
 
-    def kept() -> Interrupted | None:
-        return Interrupted("search for kicks", _smallest(kicks, settling)) if kicks else None
-
-    with at_work("minimal kick", kept, progress=progress, unit="start") as settling.report:
+    found = lambda: _smallest(kicks, settling) if kicks else None
+    with at_work("search for kicks", found, progress=progress, unit="start") as settling.report:
         if phase > 0:
             settling, start = settling.at_phase(start, phase)
             kick = dataclasses.replace(kick, start=start)
         rays = first_exits(settling, kick, directions, points, largest, seed)
         angle = 2 * np.pi / directions ** (1 / max(1, kick.size - 1))  # between neighbours
         for unit, radius in nearest_first(rays, candidates):
-            found = _exact(settling, kick, unit, radius, angle, longest, seed)
-            new = _described(settling, kick, found, longest, cycle, phase)
+            exact = _exact(settling, kick, unit, radius, angle, longest, seed)
+            new = _described(settling, kick, exact, longest, cycle, phase)
             if all(_distance(new, old) > _SAME for old in kicks):
                 kicks.append(new)
     return _smallest(kicks, settling)

@@ -7,7 +7,6 @@ import itertools
 import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -52,7 +51,7 @@ from ..machine import (
 )
 from ..orbit import MotionSections, index_of
 from . import _geometry as geometry
-from ._scan import LanesFailed, interrupted, scan
+from ._scan import LanesFailed, place_in_words, scan
 from .measures import CODES, REGIMES, Regime, Sections, flags, legends
 from .program import START, check_leaf_name, start_with
 
@@ -439,7 +438,8 @@ def basins(
     begin = mapper.begin_of(machine)
     axes = starts_in(region, machine, begin, resolution, samples, count("seed", seed))
     data = mapper.scan(machine, axes, paired=samples is not None, progress=progress, **options)
-    with at_work("sorting", partial(interrupted, data, options.get("store")), progress=False):
+    where = place_in_words(options.get("store"))
+    with at_work("sorting", lambda: data, progress=False, where=where):
         return mapper.basins_in(data, machine)
 
 
@@ -664,8 +664,9 @@ def integrity_profile(
     _scales_along([*axes], scales)
     data = mapper.scan(machine, {parameter: row, **axes}, progress=progress, **options)
     found, integrity = [], []
-    kept = partial(interrupted, data, options.get("store"))
-    with at_work("basins", kept, progress=progress, unit="value", total=row.size) as report:
+    bar = {"progress": progress, "unit": "value", "total": row.size}
+    where = place_in_words(options.get("store"))
+    with at_work("sorting of basins", lambda: data, **bar, where=where) as report:
         for i, value in enumerate(row):
             part = data.isel({parameter: i}).load()
             found.append(mapper.basins_in(part, with_leaf(machine, parameter, value)))

@@ -1,7 +1,6 @@
 """`scan`: a labelled data set of motions over axes of parameters and starts."""
 
 import contextlib
-import dataclasses
 import functools
 import itertools
 import json
@@ -23,10 +22,10 @@ from jaxtyping import Array
 
 from .. import lanes
 from .._checks import axes_of, count, fits_records, flag, instance_of
-from .._messages import Interrupted, at_work, warn, warning_once
+from .._messages import IN_PARTIAL, at_work, warn, warning_once
 from .._programs import PLAIN, CompiledFunction
 from .._types import State, xr
-from ..flow import REASON_NAMES, AbstractMethod, MethodLike, RunOptions, compiling, preset
+from ..flow import REASON_NAMES, MethodLike, RunOptions, compiling
 from ..machine import AbstractMachine
 from .program import Blocks, ScanProgram, check_corners, make_program
 from .store import MemoryStore, Where, ZarrStore, opened
@@ -48,11 +47,11 @@ _PATIENCE = 10.0
 _LONG = 6
 
 
-def interrupted(data: "xr.Dataset", store: str | Path | None) -> Interrupted:
+def place_in_words(store: str | Path | None) -> str:
+    """Return the place of the results of an interrupted scan."""
     if store is None:
-        return Interrupted("scan", data)
-    where = f"what was computed is in {store}, and the same call continues from there"
-    return Interrupted("scan", data, where)
+        return IN_PARTIAL
+    return f"what was computed is in {store}, and the same call continues from there"
 
 
 class Workplace(NamedTuple):
@@ -92,8 +91,8 @@ def computed(
         _ = xr.Dataset  # loaded now: an interrupt should not wait for that
         done = blocks.total - sum(map(_size_of, todo))
         with at_work(
-            "scan", lambda: interrupted(storage.data(), store),
-            progress=progress, unit="lane", total=blocks.total, done=done,
+            "scan", storage.data, progress=progress, unit="lane", total=blocks.total, done=done,
+            where=place_in_words(store),
         ) as report:  # fmt: skip
 
             def write(where: Where, numbers: dict[str, np.ndarray]) -> None:
@@ -118,10 +117,9 @@ def in_blocks(
     paired: bool,
     store: str | Path | None = None,
     lanes: int | None = None,
-    numbers: np.ndarray | None = None,
 ) -> Blocks:
     """Return the grid in blocks of `lanes`, by default those of the store or suitable for the
-    workplace. The lanes' `numbers`, by default their indices, determine their noise."""
+    workplace. The lanes' indices determine their noise."""
     total = Blocks(grid, 1, paired=paired).total
     if store is not None and lanes is None:
         lanes = _lanes_in(Path(store))
@@ -133,14 +131,12 @@ def in_blocks(
         lanes = math.ceil(min(count("lanes", lanes, least=1), total) / step) * step
     points = program.cycles * max(1, program.options.samples) + 1
     fits_records(argument, lanes * points, 12)
-    if program.lane_noise is not None and numbers is None:
-        if total > 2**32:  # lanes have 32-bit numbers
-            raise ValueError(
-                f"Argument `axes` must have at most {2**32:,} lanes where there is noise, but has "
-                f"{total:,}."
-            )
-        numbers = np.arange(total, dtype=np.uint32)
-    return Blocks(grid, lanes, paired=paired, numbers=numbers)
+    if program.lane_noise is not None and total > 2**32:  # lanes have 32-bit numbers
+        raise ValueError(
+            f"Argument `axes` must have at most {2**32:,} lanes where there is noise, but has "
+            f"{total:,}."
+        )
+    return Blocks(grid, lanes, paired=paired, numbered=program.lane_noise is not None)
 
 
 def _lanes_in(path: Path) -> int | None:
@@ -346,7 +342,6 @@ def scan(
     noise: Any = None,
     key: Any = None,
     paired: bool = False,
-    verify: int = 0,
     max_impacts: int = 1000,
     max_steps: int | None = None,
     store: str | Path | None = None,
@@ -380,9 +375,6 @@ def scan(
       (the last axis varies fastest) has the key `jax.random.fold_in(key, n)`. `"noise.V"` is an
       axis of amplitudes, `"noise.path"` of paths. Measures that need a period are refused.
     - `paired`: a lane for each index in the rows (of one length), along `sample`, and no grid.
-    - `verify`: the number of random lanes that are run again by a more accurate method.
-      `data.attrs` then has the number of different lanes (`verified_changed_period`, for integers)
-      or the 95 % quantile of the error (`verified_error_y_min`; infinite if one failed).
     - `store`: the folder of a Zarr store, written block by block. The same call resumes it and
       computes lost blocks again. A changed call (or code of yours) is refused, with the difference.
     - `lanes`: lanes in a block (a multiple of 256); memory grows with it and with `cycles`.
@@ -398,7 +390,7 @@ def scan(
     **Raises:** `ValueError` or `TypeError` before any work for unusable arguments; on Ctrl-C
     `Interrupted`; `ConnectionError`, with the number of stored blocks, if the cluster is lost.
     """
-    grid, verify = axes_of(axes), count("verify", verify)
+    grid = axes_of(axes)
     progress, paired = flag("progress", progress), flag("paired", paired)
     if store is not None:
         instance_of("store", store, (str, Path), "a path")
@@ -411,56 +403,15 @@ def scan(
     options = RunOptions(
         settle=settle, method=method, clock=clock, max_impacts=max_impacts, max_steps=max_steps
     )
-    what = {"measure": measure, "start": start, "cycles": cycles, "noise": noise, "key": key}
-    make = functools.partial(make_program, machine, tuple(grid), **what)
-    program = make(options, derivatives=derivatives)
+    program = make_program(
+        machine, tuple(grid), options, measure=measure, start=start, cycles=cycles, noise=noise,
+        key=key, derivatives=derivatives,
+    )  # fmt: skip
     place = workplace(workers, devices, cluster)
     blocks = in_blocks(program, grid, place, paired, store, lanes)
     data = computed(program, blocks, place, store, progress)
-    if verify:
-        better = make(dataclasses.replace(options, method=_finer_method(program)))
-        data.attrs |= _verified(data, blocks, verify, better, place, store)
     _warn_of_failures(data)
     return data
-
-
-def _finer_method(program: ScanProgram) -> AbstractMethod:
-    best, used = preset(program.machine, "reference"), program.method
-    if type(best) is type(used) and best.steps_per_cycle <= used.steps_per_cycle:
-        return used.tighter()
-    steps = max(best.steps_per_cycle, 2 * used.steps_per_cycle)
-    return dataclasses.replace(best, steps_per_cycle=steps)
-
-
-def _verified(
-    data: "xr.Dataset", blocks: Blocks, lanes: int, program: ScanProgram, place: Workplace,
-    store: str | Path | None,
-) -> dict[str, Any]:  # fmt: skip
-    """Return attributes: differences of some random lanes between `data` and a better program."""
-    total = data["result"].size
-    lanes = min(lanes, total)
-    drawn = np.sort(np.random.default_rng(0).choice(total, lanes, replace=False))
-    places = np.unravel_index(drawn, data["result"].shape)
-    if blocks.paired:
-        places = (drawn,) * len(blocks.axes)
-    axes = {name: x[i] for (name, x), i in zip(blocks.axes.items(), places, strict=True)}
-    numbers = None if program.lane_noise is None else drawn.astype(np.uint32)  # their own noise
-    checked_blocks = in_blocks(program, axes, place, paired=True, numbers=numbers)
-    kept = functools.partial(interrupted, data, store)
-    with at_work("verification", kept, progress=False):
-        better = computed(program, checked_blocks, place)
-    found: dict[str, Any] = {"verified_lanes": lanes}
-    for name in better:
-        values = np.asarray(data[name]).reshape(total, -1)[drawn]
-        accurate = np.asarray(better[name]).reshape(lanes, -1)
-        if values.dtype.kind == "f":
-            same = (values == accurate) | (np.isnan(values) & np.isnan(accurate))
-            difference = np.where(same, 0.0, np.abs(values - accurate))
-            worst = np.where(np.isfinite(difference), difference, np.inf).max(axis=1)
-            found[f"verified_error_{name}"] = float(np.quantile(worst, 0.95, method="higher"))
-        else:
-            found[f"verified_changed_{name}"] = int((values != accurate).any(axis=1).sum())
-    return found
 
 
 def _warn_of_failures(data: "xr.Dataset") -> None:

@@ -270,8 +270,7 @@ def sweep(
             max_steps, lane_noise, first,
         )  # fmt: skip
 
-    # With noise, the index of the value is carried along: each has its own path.
-    carry = start if lane_noise is None else (start, jnp.uint32(0))
+    carry = start, jnp.uint32(0)
     if values.size <= _AT_ONCE or not is_outermost(machine, values, start, regime, lane_noise):
         return step(carry, values)[1]
     return _in_pieces(step, carry, np.asarray(values), progress)
@@ -359,18 +358,14 @@ def moved_by_stops(machine: AbstractMachine, state: State) -> State:
 def _sweep(
     machine, parameter, values, start, settle, cycles, method, rests, regime, measures,
     max_steps, lane_noise, first,
-) -> tuple[State, Sweep]:  # fmt: skip
-    """Return the state after the last value, and the results at each; `start`, with noise with the
-    index of the first value; `first`, the state at the first value of all."""
+) -> tuple[tuple[State, Array], Sweep]:  # fmt: skip
+    """Return the state after the last value and the next index, and the results at each; `start` is
+    such a pair, as with noise each value has its own path; `first`, the state at the very first."""
 
-    def run_value(state, value):
-        current, noise = with_leaf(machine, parameter, value), {}
-        state, number = (state, None) if lane_noise is None else state
+    def run_value(carry, value):
+        (state, number), current, noise = carry, with_leaf(machine, parameter, value), {}
         if lane_noise is not None:
-            noise = {
-                "noise": lane_noise.noise,
-                "key": lane_key(lane_noise.key, jnp.asarray(number)),
-            }
+            noise = {"noise": lane_noise.noise, "key": lane_key(lane_noise.key, number)}
         state = moved_by_stops(current, state)
         run = simulate(
             current, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps,
@@ -378,7 +373,6 @@ def _sweep(
             **noise,
         )  # fmt: skip
         state = jtu.tree_map(lambda a, b: jnp.where(run.successful, a, b), run.last, state)
-        next_carry = state if number is None else (state, number + jnp.uint32(1))
         assert run.duration is not None and run.impact_energy is not None
         found = Usual("extremes")(current, run) | regime.begun(first)(current, run)
         measured = {name: x for each in measures for name, x in each(current, run).items()}
@@ -388,7 +382,7 @@ def _sweep(
                 "Argument `measure` must be of one number a motion, but arrays are "
                 f"{', '.join(rows)}: use `scan`."
             )
-        return next_carry, Sweep(
+        return (state, number + jnp.uint32(1)), Sweep(
             parameter=parameter,
             values=value,
             y_min=found["y_min"],

@@ -73,8 +73,8 @@ def part_of(name: str) -> str | None:
 
 class Blocks:
     """A grid cut into rectangles with at most `lanes` lanes, contiguous in the grid's order. With
-    `paired` axes, one lane has the values at one index of all rows. `numbers`, one for each lane in
-    the grid's order, are added to the lanes' values."""
+    `paired` axes, one lane has the values at one index of all rows. If `numbered`, the index of
+    each lane in the grid's order is added to its values."""
 
     def __init__(
         self,
@@ -82,7 +82,7 @@ class Blocks:
         lanes: int,
         *,
         paired: bool = False,
-        numbers: np.ndarray | None = None,
+        numbered: bool = False,
     ):
         self.axes, self.paired, self.lanes = dict(axes), paired, lanes
         self.dims = ("sample",) if paired else tuple(axes)
@@ -93,7 +93,9 @@ class Blocks:
             block.append(min(size, room))
             room //= min(size, room)
         self.block = tuple(reversed(block))
-        self.numbers = None if numbers is None else numbers.reshape(self.shape)
+        self.numbers = None
+        if numbered:
+            self.numbers = np.arange(self.total, dtype=np.uint32).reshape(self.shape)
 
     @property
     def total(self) -> int:
