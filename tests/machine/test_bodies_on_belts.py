@@ -104,33 +104,6 @@ def test_static_friction_lets_go_on_a_belt(method):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:vi_jax is running in single precision")
-@pytest.mark.parametrize("kind", [Belt, Blocks])
-def test_single_precision(kind):
-    """Regression: of these 96 machines 8 and 11 were lost. Guards counted as jumped by rounding,
-    and small forces of friction as ties. One was off by 3e-3: an event was accepted far from its
-    place. One of each is still lost: rounding turns a body that sticks, or the body that begins to
-    slip sticks again."""
-    draw, n = np.random.default_rng(5).uniform, 96
-    if kind is Belt:
-        start = dict(a=0.2, b=0.3)
-        ranges = dict(
-            w=(0.4, 1.5), level=(0.1, 1), between=(0.1, 0.8), ratio=(1, 1.5), size=(0.1, 0.6),
-            drift=(-0.3, 0.3), drive=(0.2, 1.0),
-        )  # fmt: skip
-        given = {name: draw(*x, n) for name, x in ranges.items()}
-    else:
-        start = dict(a=0.8, b=0.3, c=-0.4)
-        given = dict(w=draw(0.4, 1.5, n), levels=draw(0.1, 0.8, (n, 3)))
-    expected, all_good = ends(kind, given, 3, **start)
-    assert all_good
-    with jax.enable_x64(False):
-        found, good = each_end(kind, given, 3, **start)
-    assert np.sum(~good) <= 1
-    np.testing.assert_allclose(found[good], expected[good], rtol=0, atol=1e-4)
-
-
-@pytest.mark.slow
 def test_a_hammer_bounces_to_rest_on_a_block_with_friction():
     """In these lanes the hammer rests on the block in the end, and both stick."""
     draw, n = np.random.default_rng(0).uniform, 300
@@ -236,6 +209,31 @@ def test_static_ratios_and_impacts_on_belts(kind):
     finer, fine = ends(machine, given, 1, vi.FixedStep(steps_per_cycle=150), **start)
     assert good and fine
     np.testing.assert_allclose(found, finer, rtol=0, atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:vi_jax is running in single precision")
+@pytest.mark.parametrize("kind", [Belt, Coupled])
+def test_single_precision(kind):
+    """Regression: of 96 belts 8 were lost, and of three bodies 11. Guards counted as jumped by
+    rounding, and small forces of friction as ties. One was off by 3e-3: an event was accepted far
+    from its place. One belt is still lost: rounding turns a body that sticks, or the body that
+    begins to slip sticks again."""
+    draw, n, start = np.random.default_rng(5).uniform, 96, dict(a=0.1, b=0.1, c=0.05, v=dict(a=0.2))
+    given, cycles = drawn(0, n), 1
+    if kind is Belt:
+        start, cycles = dict(a=0.2, b=0.3), 3
+        ranges = dict(
+            w=(0.4, 1.5), level=(0.1, 1), between=(0.1, 0.8), ratio=(1, 1.5), size=(0.1, 0.6),
+            drift=(-0.3, 0.3), drive=(0.2, 1.0),
+        )  # fmt: skip
+        given = {name: draw(*x, n) for name, x in ranges.items()}
+    expected, all_good = ends(kind, given, cycles, **start)
+    assert all_good
+    with jax.enable_x64(False):
+        found, good = each_end(kind, given, cycles, **start)
+    assert np.sum(~good) <= 1
+    np.testing.assert_allclose(found[good], expected[good], rtol=0, atol=1e-4)
 
 
 @pytest.mark.slow
