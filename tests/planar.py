@@ -53,8 +53,11 @@ class Rod(vi.Mechanical):
     restitution: Any = 0.0
     weight: Any = 9.81
     cycle: Any = 0.02
+    inertia: Any = 1 / 3
     q = ("x", "y", "theta")
-    mass = (1.0, 1.0, 1 / 3)
+
+    def mass(self, q):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return 1.0, 1.0, self.inertia
 
     @property
     def contacts(self):
@@ -73,5 +76,5 @@ class Rod(vi.Mechanical):
         return self.at(y=s, theta=theta, v=speeds)
 
     def energy(self, z):
-        own = z.v.x**2 + z.v.y**2 + z.v.theta**2 / 3
+        own = z.v.x**2 + z.v.y**2 + self.inertia * z.v.theta**2
         return 0.5 * own + self.weight * z.y

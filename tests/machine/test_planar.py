@@ -166,6 +166,25 @@ def test_a_rod_that_slides_into_the_ground_jams():
     assert bool((gain[~jams] < 1e-12).all())
 
 
+def test_rods_of_any_mass_ratio_jam_beyond_painleves_limit():
+    """With inertia J, mass and half-length 1, p = 1 + cos²θ/J - μ sinθ cosθ/J for slip -1, so that
+    the rod jams for μ > (J + cos²θ)/(sinθ cosθ). At rest across the
+    floor b = -g."""
+
+    def result(inertia, theta, share):
+        s, c = jnp.sin(theta), jnp.cos(theta)
+        rod = Rod(mu=share * (inertia + c * c) / (s * c), inertia=inertia, cycle=1e-6)
+        return vi.simulate(rod, rod.sliding(theta, -1.0, 0.0), 1).successful
+
+    J, theta, share = (
+        x.ravel() for x in jnp.meshgrid(
+            jnp.asarray([0.05, 0.2, 1 / 3, 1.2]), jnp.asarray([0.4, 1.0, 1.3]),
+            jnp.asarray([0.99, 1.0 - 1e-6, 1.0 + 1e-6, 1.01]),
+        )
+    )  # fmt: skip
+    np.testing.assert_array_equal(jax.jit(jax.vmap(result))(J, theta, share), share < 1)
+
+
 def test_a_rod_that_bounces_to_rest_sticks_at_once():
     """Its last bounces are summed up, and in their time the tip gets a slip of second order."""
 
