@@ -281,7 +281,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     )
 
 
-def _nearest(machine: AbstractMachine, points: State, distances: list[Array]) -> Array:
+def _nearest(machine: AbstractMachine, points: State, distances: list[Any]) -> Array:
     """Return the distances (of each coordinate that stops limit, by cycle) of the coordinate that
     comes nearest to one of its stops, as a share of its motion: others may have another unit."""
     if len(distances) == 1:
