@@ -373,8 +373,9 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
                 f"`machine.at(...)` returns, but got {state!r}."
             )
     try:
-        both = lambda x, z: [jnp.asarray(part(z)) for part in (x.position, x.velocity)]
-        place, velocity = eqx.filter_eval_shape(both, machine, state)
+        both = lambda x, z: (jnp.asarray(x.position(z)), jnp.asarray(x.velocity(z)))
+        shapes = eqx.filter_eval_shape if _has_functions(machine) else lambda f, *args: f(*args)
+        place, velocity = shapes(both, machine, state)
         shape = place.shape or velocity.shape
     except (AttributeError, TypeError, LookupError) as error:
         raise TypeError(
@@ -393,8 +394,11 @@ def _evaluated(
 ) -> Any:
     """Return `function(machine, state)`: of a machine with gaps that are functions by one program,
     not by one for each operation."""
-    has_functions = any(callable(getattr(x, "on", None)) for x in contacts_in(machine))
-    return (eqx.filter_jit(function) if has_functions else function)(machine, state)
+    return (eqx.filter_jit(function) if _has_functions(machine) else function)(machine, state)
+
+
+def _has_functions(machine: AbstractMachine) -> bool:
+    return any(callable(getattr(x, "on", None)) for x in contacts_in(machine))
 
 
 def _check_turn(machine: AbstractMachine, start: State) -> None:

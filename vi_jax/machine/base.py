@@ -290,7 +290,8 @@ class AbstractMachine(Shown):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if not is_builtin(cls):
+        # A class with the name of its base is a form that the package makes of a user's machine.
+        if not is_builtin(cls) and cls.__qualname__ != cls.__mro__[1].__qualname__:
             _refuse_taken_names(cls, vars(cls))
         with_own_defaults(cls)
 
