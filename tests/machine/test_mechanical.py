@@ -349,7 +349,10 @@ WRONG = [
     ({"q": ("left", "left")}, "`q` of a Wrong must have different names"),
     ({"q": ("left", "v")}, "none of them `v`"),
     ({"contacts": vi.RigidStop(1.0, 0.5, on="left", mass=7.0)}, "whose own masses are used"),
-    ({"contacts": vi.RigidStop(1.0, 0.5, on="up")}, "`on` of a contact must be one of the coord"),
+    (
+        {"contacts": vi.RigidStop(1.0, 0.5, on="up")},
+        "`along` of a contact must be one of the coord",
+    ),
     ({"contacts": vi.SoftStop(1.0, 9.0, on=("left", "v"))}, "must be one of the coordinates"),
 ]
 

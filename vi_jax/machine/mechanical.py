@@ -292,8 +292,8 @@ def _coordinate_name(machine: Mechanical, on: Any) -> str | None:
     if len(machine._q_shapes.get(base, (0,))) != len(index):
         names = [x + str([0] * len(shape)) * bool(shape) for x, shape in machine._q_shapes.items()]
         raise ValueError(
-            f"Argument `on` of a contact must be one of the coordinates {tuple(names)}, or a "
-            f"function of them, but got {on!r}."
+            f"Argument `on` or `along` of a contact must be one of the coordinates "
+            f"{', '.join(names)}, or a function of them, but got {on!r}."
         )
     return name
 
