@@ -51,3 +51,20 @@ def test_signs_of_the_entries_decide_the_outcome():
     assert (find_attractors(turned, offsets).period < 0).any()
     smooth = LocalMap(np.array([[[-0.5]]]), ones, ones, np.array([1.5]), np.ones(1))
     assert scenario_of(smooth, offsets, find_attractors(smooth, offsets))[0] == "persistence"
+
+
+def test_periods_of_a_strongly_unstable_motion():
+    """Regression: a power of the matrix was singular to rounding, so `grazing` raised an error. In
+    the matrix's eigenvectors the states are λʲ/(1 - λⁿ)."""
+    values, vectors = np.array([60.0, 1e-3]), np.array([[1.0, 0.4], [-0.7, 1.0]])
+    matrix = vectors @ np.diag(values) @ np.linalg.inv(vectors)
+    kick = np.array([0.3, 1.0])
+    one = np.ones(1)
+    local = LocalMap(matrix[None], np.array([[1.0, 0.2]]), kick[None], 0.5 * one, one)
+    for n in (1, 3, 16):
+        powers = np.arange(n + 1)[:, None]
+        shares = np.where(values > 1, -(values ** (powers - n)) / (1 - values**-n), values**powers)
+        shares = np.where(values > 1, shares, shares / (1 - values**n))
+        expected = (shares * np.linalg.solve(vectors, kick)) @ vectors.T
+        np.testing.assert_allclose(local.kicked(n), expected, rtol=1e-12, atol=1e-14)
+    assert np.isnan(windows(local, 1e-2, 16).stable).all()

@@ -195,8 +195,7 @@ def _are_adjacent(offsets: np.ndarray, period: np.ndarray) -> bool:
 
 def _sum_of_entries(local: LocalMap) -> float:
     """Return Σ eₙ; its sign gives the side of the motion with an impact in each period."""
-    N, u = local.matrix, local.kicks[0]
-    return float(local.gradients[0] @ np.linalg.solve(np.eye(len(N)) - N, N @ u))
+    return float(local.gradients[0] @ local.kicked(1)[-1])
 
 
 class Windows(NamedTuple):
@@ -223,10 +222,10 @@ def windows(local: LocalMap, reach: float, count: int) -> Windows:
     existing, stable = [], []
     for n in range(1, count + 1):
         power = np.linalg.matrix_power(N, n)
-        after_n = np.linalg.solve(identity - power, power @ kick)  # state after n periods, over y
-        residual = depths**2 + (h @ after_n) * depths
+        *passages, last = local.kicked(n)[1:] @ h  # distances, over y
+        residual = depths**2 + last * depths
         offset = -residual / local.slopes[0]
-        passages = local.later_distances(after_n + kick, n - 1)
+        passages = np.array(passages)
         exists = (-residual + passages[:, None] * depths > 0).all(axis=0)
         kick_slopes = np.einsum("y,i,j->yij", -0.5 / depths, kick, h)
         values = np.linalg.eigvals(power @ (identity + kick_slopes))

@@ -50,24 +50,29 @@ class LocalMap(eqx.Module):
             product = N @ product
         return product
 
-    def later_distances(self, u: np.ndarray, count: int) -> np.ndarray:
-        """Return ∂h·Nⁿ·u, n = 1 … count."""
-        found, matrix = [], self.matrix
+    def entries(self, count: int) -> np.ndarray:
+        """Return e_n = ∂h·Nⁿ·kick of the first touch, n = 1 … count: the change of the distance n
+        periods after a penetration of depth one."""
+        found, u, matrix = [], self.kicks[0], self.matrix
         for _ in range(count):
             u = matrix @ u
             found.append(self.gradients[0] @ u)
         return np.array(found)
 
-    def entries(self, count: int) -> np.ndarray:
-        """Return e_n = ∂h·Nⁿ·kick of the first touch, n = 1 … count: the change of the distance n
-        periods after a penetration of depth one."""
-        return self.later_distances(self.kicks[0], count)
+    def kicked(self, n: int) -> np.ndarray:
+        """Return the states after the kick and after each of n periods, (n + 1, states), of a
+        motion with one kick of depth one in n periods. They are solved for together, as a power of
+        an unstable matrix is singular to rounding."""
+        size = len(self.matrix)
+        steps = np.kron(np.eye(n + 1, k=-1), self.matrix)
+        steps[:size, -size:] += np.eye(size)  # the last one precedes the kick
+        right = np.append(self.kicks[0], np.zeros(n * size))
+        return np.linalg.solve(np.eye(len(steps)) - steps, right).reshape(n + 1, size)
 
     def passages(self, n: int) -> np.ndarray:
         """Return ∂h (Nʲ - Nⁿ) (I - Nⁿ)⁻¹ kick, j = 1 … n - 1: the distances at the passages between
         the impacts, with one impact of depth one in n periods. They must be positive."""
-        power = np.linalg.matrix_power(self.matrix, n)
-        found = self.later_distances(np.linalg.solve(np.eye(len(power)) - power, self.kicks[0]), n)
+        found = self.kicked(n)[1:] @ self.gradients[0]
         return found[:-1] - found[-1]
 
     def resonance(self, n: int, sign: int) -> float:
