@@ -213,24 +213,18 @@ def equations_along(
     blank = Shooting(machine, method, like, cycles, (), (), steps, parameters)
     states, modes = _follow_events(blank, state, found, period)
     _check_instants(blank, found, states, modes)
-    if steps_depend_on_motion(blank):
-        halved = dataclasses.replace(blank, steps=max(1, blank.steps // 2))
-        before, _ = _follow_events(halved, state, found, period)
-        # Of two that agree keep the finer one: flights may need more steps along the branch.
-        while _differ(blank, states, before) and 2 * blank.steps <= _MOST:
-            before, method = states, blank.method.tighter()
-            blank = dataclasses.replace(blank, steps=2 * blank.steps, method=method)
-            states, modes = _follow_events(blank, state, found, period)
+    while steps_depend_on_motion(blank) and 2 * blank.steps <= _MOST:
+        before = states
+        blank = dataclasses.replace(blank, steps=2 * blank.steps)
+        states, modes = _follow_events(blank, state, found, period)
+        if np.max(np.abs(states - before) / _sizes(blank, states)) < CORRECTED:
+            break  # keep the finer one: flights may need more steps along the branch
+        blank = dataclasses.replace(blank, method=blank.method.tighter())
     problem = dataclasses.replace(blank, events=events, modes=modes)
     states = states[:-1] if found else states
     values = np.array([leaf(machine, name) for name in parameters])
     x = problem.pack(np.asarray(clocks), states, values, period)
     return with_sizes(problem, x), np.asarray(x)
-
-
-def _differ(problem: Shooting, states: np.ndarray, before: np.ndarray) -> bool:
-    change = np.abs(states - before) / _sizes(problem, states)
-    return not np.max(change) < CORRECTED
 
 
 def _ends(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> list[Scalar]:
