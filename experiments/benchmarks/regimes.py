@@ -50,17 +50,22 @@ class Ring(vi.AbstractMachine):
         return dict(x=0.0 * z.x, y=0.0 * z.y)
 
 
-class Row(vi.Mechanical):
-    """Two bodies in a row; the first is driven and strikes a stop."""
+class Driven(vi.Mechanical):
+    """A machine whose cycle is that of a drive."""
 
-    q = ("a", "b")
-    mass = 1.0, 0.5
     omega: Any = 1.0
-    gap: Any = 1.1
 
     @property
     def cycle(self):
         return 2 * jnp.pi / self.omega
+
+
+class Row(Driven):
+    """Two bodies in a row; the first is driven and strikes a stop."""
+
+    q = ("a", "b")
+    mass = 1.0, 0.5
+    gap: Any = 1.1
 
     def force(self, t, q, v):
         link = q.a - q.b + 0.05 * (v.a - v.b)
@@ -71,17 +76,12 @@ class Row(vi.Mechanical):
         return vi.RigidStop(self.gap, 0.8, on="a")
 
 
-class Coupled(vi.Mechanical):
+class Coupled(Driven):
     """Two coupled van der Pol oscillators; the first one is driven."""
 
     q = ("x", "y")
     mass = 1.0, 1.0
-    omega: Any = 1.15
     coupling: Any = 0.3
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi / self.omega
 
     def force(self, t, q, v):
         link = self.coupling * (q.x - q.y)

@@ -22,7 +22,7 @@ def check_faults() -> list[Fault]:
 
 
 def _drift(**printed: float) -> float:
-    """Return `energy_drift` of Table 1's machine with these coefficients in place of its own."""
+    """Return the `energy_drift` of Table 1's machine with other coefficients."""
     return energy_drift(**_groups(), **printed)
 
 

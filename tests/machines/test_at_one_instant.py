@@ -232,7 +232,7 @@ def test_impacts_coupled_by_friction():
 
 
 class PushedOn(vi.Mechanical):
-    """A body without a force of its own between a wall and another one that pushes it."""
+    """Two bodies at a wall. At first a force acts on the second alone, which presses both on it."""
 
     q = ("a", "b")
     mass = (1.0, 2.0)

@@ -374,8 +374,8 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
             )
     try:
         both = lambda x, z: (jnp.asarray(x.position(z)), jnp.asarray(x.velocity(z)))
-        shapes = eqx.filter_eval_shape if _has_functions(machine) else lambda f, *args: f(*args)
-        place, velocity = shapes(both, machine, state)
+        shapes_of = lambda function: functools.partial(eqx.filter_eval_shape, function)
+        place, velocity = _evaluated(machine, both, state, shapes_of)
         shape = place.shape or velocity.shape
     except (AttributeError, TypeError, LookupError) as error:
         raise TypeError(
@@ -390,15 +390,13 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
 
 
 def _evaluated(
-    machine: AbstractMachine, function: Callable[[Any, State], Any], state: State
-) -> Any:
-    """Return `function(machine, state)`: of a machine with gaps that are functions by one program,
-    not by one for each operation."""
-    return (eqx.filter_jit(function) if _has_functions(machine) else function)(machine, state)
-
-
-def _has_functions(machine: AbstractMachine) -> bool:
-    return any(callable(getattr(x, "on", None)) for x in contacts_in(machine))
+    machine: AbstractMachine, function: Callable[[Any, State], Any], state: State,
+    transform: Callable[..., Any] = eqx.filter_jit,
+) -> Any:  # fmt: skip
+    """Return `function(machine, state)`: of a machine with gaps that are functions transformed, by
+    default to one program, not one for each operation."""
+    has_functions = any(callable(getattr(x, "on", None)) for x in contacts_in(machine))
+    return (transform(function) if has_functions else function)(machine, state)
 
 
 def _check_turn(machine: AbstractMachine, start: State) -> None:

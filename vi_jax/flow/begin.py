@@ -97,11 +97,11 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
 def _contacts_at(
     plan: Plan, start: State, current: list[Rates], jerks: list[Scalar]
 ) -> tuple[Scalars, tuple[Flag, ...]]:
-    """Return the stops on which the coordinates rest, by their rates and those of the forces: they
-    are pressed on, or about to be by a force that grows. Of several contacts, `pressed_contacts`
-    decides later: return whether each touches its stop without a force of its own, but may be
-    pressed on by another body. Positions and velocities are known to the rounding of a search that
-    ends there.
+    """Return the stops on which the coordinates rest, and for each coordinate whether no force
+    presses it on its stop. By their rates and those of the forces they are pressed on, or about to
+    be by a force that grows. Of several contacts all that touch are returned: another body may
+    press on them, and `pressed_contacts` decides. Positions and velocities are known to the
+    rounding of a search that ends there.
     """
     machine, found, touching = plan.machine, [], []
     for k, (here, jerk) in enumerate(zip(current, jerks, strict=True)):
@@ -114,10 +114,10 @@ def _contacts_at(
         rests, pressed = {}, jnp.zeros((), bool)
         for i in stops_on(machine, k):
             stop = stops_of(machine)[i]
-            here_pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * jerk > 0)
-            rests[i] = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slow)
-            pressed = pressed | rests[i] & here_pressed
-            rests[i] = rests[i] & (here_pressed | is_compound(machine))
+            stands = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slow)
+            pushes = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * jerk > 0)
+            pressed = pressed | stands & pushes
+            rests[i] = stands if is_compound(machine) else stands & pushes
         found.append(chosen_stop(machine, k, rests, jnp.zeros_like(here.x)))
         touching.append((here.a == 0) & ~pressed)
     return tuple(found), tuple(touching)

@@ -19,7 +19,14 @@ from jaxtyping import Array, Float, Int
 from .._programs import compiled
 from .._types import Flag, Scalar, State
 from ..flow import AbstractMethod, ImplicitSteps, simulate
-from ..machine import frequency_ratio, own_modes, phase_at, scales_known, with_modes
+from ..machine import (
+    AbstractMachine,
+    frequency_ratio,
+    own_modes,
+    phase_at,
+    scales_known,
+    with_modes,
+)
 from .equations import Shooting, Unknowns
 from .results import ORBIT_RESULTS, Orbit
 from .tolerances import CORRECTED, LISTED, ROUGHLY
@@ -214,16 +221,22 @@ def steps_depend_on_motion(problem: Shooting) -> bool:
     return paced or not scales_known(machine) or isinstance(problem.method, ImplicitSteps)
 
 
+@compiled
+def fewest_steps(method: AbstractMethod, machine: AbstractMachine, like: State) -> Scalar | float:
+    """Return the number of steps in a cycle that the longest step allows, here a real number."""
+    return machine.cycle / method.longest(machine, jnp.zeros(()), like)
+
+
 def method_of_runs(problem: Shooting, xs: Sequence[Unknowns]) -> AbstractMethod:
     """Return the method with about as many steps in a cycle as the flights of these solutions, if
     that number depends on the motion; host-side. Doubled steps need few programs."""
-    method, s = problem.method, jnp.zeros(())
+    method = problem.method
     if not steps_depend_on_motion(problem):
         return method
     for x in xs:
         machine, legs = problem.at(x), problem.lengths(x).max() / float(problem.period(x))
         needed = problem.steps / (legs * problem.cycles)
-        while needed > _ALMOST * float(machine.cycle / method.longest(machine, s, problem.like)):
+        while needed > _ALMOST * float(fewest_steps(method, machine, problem.like)):
             method = method.tighter()
     return method
 

@@ -222,11 +222,10 @@ def windows(local: LocalMap, reach: float, count: int) -> Windows:
     existing, stable = [], []
     for n in range(1, count + 1):
         power = np.linalg.matrix_power(N, n)
-        *passages, last = local.kicked(n)[1:] @ h  # distances, over y
-        residual = depths**2 + last * depths
+        distances = local.kicked(n)[1:] @ h  # over y
+        residual = depths**2 + distances[-1] * depths
         offset = -residual / local.slopes[0]
-        passages = np.array(passages)
-        exists = (-residual + passages[:, None] * depths > 0).all(axis=0)
+        exists = (-residual + distances[:-1, None] * depths > 0).all(axis=0)
         kick_slopes = np.einsum("y,i,j->yij", -0.5 / depths, kick, h)
         values = np.linalg.eigvals(power @ (identity + kick_slopes))
         existing.append(_interval(offset[exists]))

@@ -63,7 +63,7 @@ from ..machine import (
     with_modes,
     without_modes,
 )
-from .corrector import on_host, step_error, steps_depend_on_motion
+from .corrector import fewest_steps, on_host, step_error, steps_depend_on_motion
 from .equations import Shooting, Unknowns
 from .flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
 from .results import Orbit
@@ -105,7 +105,7 @@ def steps_of(
 ) -> int:
     """Return the steps of a flight over so many cycles, for the most demanding of the machines."""
     # Turning points are sought between steps: this needs more steps than the flight itself.
-    fewest = (ceil(1.02 * float(_fewest_steps(method, machine, like))) for machine in machines)
+    fewest = (ceil(1.02 * float(fewest_steps(method, machine, like))) for machine in machines)
     return max(method.steps_per_cycle, 16, *fewest) * cycles
 
 
@@ -123,11 +123,6 @@ def longest_leg(
 def cycles_to_fly(problem: Shooting, x: Unknowns) -> int:
     places, _, period = problem.values(x)
     return longest_leg(places, problem.events, period, problem.cycles)
-
-
-@compiled
-def _fewest_steps(method: AbstractMethod, machine: AbstractMachine, like: State) -> Scalar | float:
-    return machine.cycle / method.longest(machine, jnp.zeros(()), like)
 
 
 # Steps are doubled until the end of a flight changes by less than `CORRECTED`, or up to this

@@ -6,7 +6,7 @@ simulated at some of these values.
 
 import dataclasses
 import itertools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -347,8 +347,10 @@ def grazing(
     if not check:
         return unchecked
     offsets = unchecked.forecast.offset[::SIMULATE_EVERY]
-    bar: Any = {"progress": progress, "unit": "value", "total": len(offsets)}
-    with at_work("check of the grazing", lambda: unchecked, **bar) as report:
+    with at_work(
+        "check of the grazing", lambda: unchecked,
+        progress=progress, unit="value", total=len(offsets),
+    ) as report:  # fmt: skip
         subset = jax.tree.map(lambda a: a[::SIMULATE_EVERY], attractors)
         by_machine, agree, far = compare_with_machine(graze, offsets, subset)
         checked, agreement = agreeing_range(np.abs(offsets), *agree)

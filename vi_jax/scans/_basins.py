@@ -664,9 +664,10 @@ def integrity_profile(
     _scales_along([*axes], scales)
     data = mapper.scan(machine, {parameter: row, **axes}, progress=progress, **options)
     found, integrity = [], []
-    bar = {"progress": progress, "unit": "value", "total": row.size}
-    where = place_in_words(options.get("store"))
-    with at_work("sorting of basins", lambda: data, **bar, where=where) as report:
+    with at_work(
+        "sorting of basins", lambda: data, progress=progress, unit="value", total=row.size,
+        where=place_in_words(options.get("store")),
+    ) as report:  # fmt: skip
         for i, value in enumerate(row):
             part = data.isel({parameter: i}).load()
             found.append(mapper.basins_in(part, with_leaf(machine, parameter, value)))

@@ -196,16 +196,15 @@ def _after_friction(
 
     contact = lane.contact or ()
 
-    def settled(modes: Scalars) -> tuple[Scalars, Scalars]:
+    def settled() -> tuple[Scalars, Scalars]:
         # A slip whose event happened is zero now, to the rounding of a surface's speed.
-        given = {i: jnp.where(here, 0.0, modes[i]) for i, (_, here) in events.items()}
-        modes = tuple(given.get(i, mode) for i, mode in enumerate(modes))
-        given = plan.machine, lane.s, lane.state, modes, contact, released
-        modes, kept = settled_contacts(*given)
+        stopped = {i: jnp.where(here, 0.0, lane.modes[i]) for i, (_, here) in events.items()}
+        modes = tuple(stopped.get(i, mode) for i, mode in enumerate(lane.modes))
+        modes, kept = settled_contacts(plan.machine, lane.s, lane.state, modes, contact, released)
         return constant_modes(modes, lane.s), kept
 
-    old = lane.modes, tuple(jnp.abs(x) for x in contact)
-    modes, kept = jax.lax.cond(any_event, lambda: settled(lane.modes), lambda: old)
+    old = lane.modes, tuple(map(jnp.abs, contact))
+    modes, kept = jax.lax.cond(any_event, settled, lambda: old)
     found = jnp.asarray(value, lane.s.dtype)
     for i, (_, here) in events.items():
         held = jnp.where(jnp.abs(modes[i]) < 1, 0.0, modes[i])  # see `Friction`
