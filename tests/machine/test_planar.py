@@ -135,6 +135,33 @@ def test_a_box_falls_flat_for_ever(method):
     np.testing.assert_allclose(found.sections.y, 1.5, atol=1e-10)
 
 
+class Table(Box):
+    """A table in a plane, with as many legs as hold it and one more."""
+
+    restitution: Any = 0.0
+
+    @property
+    def contacts(self):
+        height = lambda q, b: q.y + b * jnp.sin(q.turn)
+        legs = (lambda q, b=b: height(q, b) for b in (-1.0, 0.0, 1.0))
+        return tuple(vi.RigidStop(0.0, self.restitution, "left", on=leg) for leg in legs)
+
+
+def test_a_table_that_falls_flat_comes_to_rest():
+    """Its spare leg rests when the others do: tested one by one, none of the legs was pressed on
+    while the others were held."""
+
+    def run(restitution):
+        table = Table(0.5, restitution)
+        found = vi.simulate(table, table.at(y=0.1), 1, max_impacts=500)
+        return found.last, found.successful, found.rests[0]
+
+    last, good, rests = jax.vmap(run)(jnp.array([0.0, 0.3, 0.5, 0.7]))
+    assert bool(good.all()) and bool((rests > 0).all())
+    for x in (last.y, last.turn, last.v.y, last.v.turn):
+        np.testing.assert_allclose(x, 0.0, atol=1e-14)
+
+
 def test_a_rod_that_slides_into_the_ground_jams():
     """P. Painlevé's rod: beyond this friction no acceleration fulfils Coulomb's law, unless the rod
     turns fast enough to lift its end."""

@@ -162,9 +162,8 @@ def test_no_motion_on_a_floor_at_rest_gains_energy():
         return jax.vmap(machine.energy)(run.sections), run.successful
 
     energy, good = map(np.asarray, jax.jit(jax.vmap(one))(*numbers))
-    # Rocks and hops that converge slowly may be given up.
-    assert good.sum() >= 118
-    assert (np.diff(energy[good], axis=1) < 1e-9).all()
+    assert good.all()
+    assert (np.diff(energy, axis=1) < 1e-9).all()
 
 
 class Stack(vi.Mechanical):

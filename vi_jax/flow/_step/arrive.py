@@ -166,7 +166,8 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
     settled = None
     if released:
         given = lane._replace(state=new, modes=modes)
-        modes, settled, value = _after_friction(plan, given, released, value)
+        modes, (any_event, kept), value = _after_friction(plan, given, released, value)
+        settled = None if len(released) == len(numbers) else any_event, kept
     clock = plan.clock(lane.s, old)
     lane = lane.log_event(taken & happens, clock, kind, logged_number, value)
     lane = _update_after(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
@@ -253,24 +254,24 @@ def _guard_jumped(
 def release_pulled(
     plan: Plan, lane: Lane, taken: Flag, when: Flag,
     before: tuple[State, Scalars], contact_before: Scalars | None = None,
-    settled: tuple[Flag, Scalars] | None = None,
+    settled: tuple[Flag | None, Scalars] | None = None,
 ) -> Lane:  # fmt: skip
     """Return the lane with those bodies free that were pressed on their stops before an event, and
     are pulled away after it: a force that jumps does not pass through zero. **Arguments:**
     `contact_before`, if contacts may have changed; `settled`, whether an event of a friction has
-    settled the contacts, and these. Asked anew without its event, frictions at their bounds would
-    hold a contact that is pressed on."""
+    settled the contacts (`None` if no other event is possible), and these. Asked anew without its
+    event, frictions at their bounds would hold a contact that is pressed on."""
     machine, contact, modes, s = plan.machine, lane.contact, lane.modes, lane.s
     if contact is None:
         return lane
     old, modes_before = before
     contacts, direction = list(contact), list(lane.direction)
     together = is_compound(machine)
-    kept = contact
-    if together:
+    any_settled, kept = settled or (None, contact)
+    if together and (settled is None or any_settled is not None):
         closed = contact if contact_before is None else _with_touching(plan, lane, contact)
-        kept = pressed_contacts(machine, s, lane.state, modes, contact, opened=closed)[1]
-        kept = kept if settled is None else select(settled[0], settled[1], kept)
+        asked = pressed_contacts(machine, s, lane.state, modes, contact, opened=closed)[1]
+        kept = asked if any_settled is None else select(any_settled, kept, asked)
     for k in limited_in(machine):
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:

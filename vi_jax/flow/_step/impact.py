@@ -32,6 +32,7 @@ from ...machine import (
     limited_in,
     longest_step,
     on_held_surfaces,
+    pressed_contacts,
     push_gains,
     row_of,
     stops_of,
@@ -298,7 +299,8 @@ def _next_impacts(instant: _Instant, sequence: _Round) -> _Round:
     rebounds = jnp.stack([-stop.sign * V for stop, V in zip(stops, after_law, strict=True)])
     share = jnp.where(weak | retry, 0.0, rebounds / jnp.where(speed > 0, speed, 1.0))
     # In the limit the contacts that are still being struck come to rest.
-    slow = (sequence.struck > 0) & (jnp.abs(stop_gradient(V[:n])) <= _STILL * fastest)
+    slow = (sequence.struck > 0) | (closing > 0)
+    slow = slow & (jnp.abs(stop_gradient(V[:n])) <= _STILL * fastest)
     group = jnp.where(retry, instant.touches, jnp.where(weak, slow, hits))
     tangential = jnp.where(weak | retry, 0.0, instant.impact.strike.tangential)
     blow = strike(
@@ -661,8 +663,8 @@ def _resting_bodies(
 ) -> tuple[dict[int, Flag], dict[int, Scalar]]:
     """Return for each coordinate that was struck, or is nearly, whether it comes to rest, and the
     time until then. `distances` are those from the stops. A body may be pressed on by another that
-    comes to rest at the same instant. Therefore each is tested while the others that rest so far
-    are held, until none changes."""
+    comes to rest at the same instant. Therefore each is tested while those of the others that rest
+    so far and are pressed on are held, until none changes."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     free = in_modes(plan.machine, lane.modes)
@@ -678,8 +680,9 @@ def _resting_bodies(
     def update(found):
         closed, _, _, count = found
         new, times = list(contact), []
+        modes, held = pressed_contacts(plan.machine, s, state, lane.modes, closed)
         for k, hit in impacts.items():
-            free_k = hold_contacts(plan.machine, lane.modes, closed, but=k)
+            free_k = hold_contacts(plan.machine, modes, held, but=k)
             # Of contacts struck in turn, each may leave faster than its law says, and all shrink.
             law = at_stop(
                 plan.machine, k, hit.contact, lambda stop, V=hit.approach: stop.coefficient(V)
@@ -688,7 +691,8 @@ def _resting_bodies(
             ends, time = _remaining_chatter(
                 plan, free_k, k, hit, speeds[k], lane, distance=distances[k]
             )
-            ends = (hit.contact > 0) & ends
+            spare = held[k] < 0  # it rests when those rest that hold it
+            ends, time = (hit.contact > 0) & (ends | spare), jnp.where(spare, 0.0, time)
             new[k] = jnp.where(ends, hit.contact, contact[k])
             times.append(jnp.where(ends, time, 0.0))
         changed = jnp.zeros((), bool)
