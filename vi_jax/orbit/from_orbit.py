@@ -125,6 +125,21 @@ def cycles_to_fly(problem: Shooting, x: Unknowns) -> int:
     return longest_leg(places, problem.events, period, problem.cycles)
 
 
+def with_parameters(
+    problem: Shooting, x: Unknowns, names: tuple[str, ...], ranges: Sequence[tuple[float, float]]
+) -> Shooting:
+    """Put these parameters before the equations' own, with steps for all their intervals."""
+    new = dataclasses.replace(problem, parameters=(*names, *problem.parameters))
+    steps = steps_of(problem.method, new.corners(ranges), problem.like, cycles_to_fly(problem, x))
+    return with_widths(dataclasses.replace(new, steps=max(problem.steps, steps)), ranges)
+
+
+def with_widths(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Shooting:
+    """Set the sizes of the parameters, half the widths of their intervals."""
+    widths = from_host(np.array([0.5 * (high - low) for low, high in ranges]))
+    return dataclasses.replace(problem, widths=widths)
+
+
 # Steps are doubled until the end of a flight changes by less than `CORRECTED`, or up to this
 # number: a choice.
 _MOST = 4096
