@@ -180,5 +180,6 @@ def orbit_table(scenes: dict[str, Scene]) -> list[TableRow]:
             closed = closed_form_orbits(scene, cycles=cycles)
             if bool(closed.admissible[0]):
                 guess = scene.start(Y=closed.Y[0], V=closed.V[0])
-                rows.append(TableRow(f"ideal, {name}", find_orbit(scene, guess, cycles=cycles)))
+                orbit = find_orbit(scene, guess, cycles=cycles, throw=True)
+                rows.append(TableRow(f"ideal, {name}", orbit))
     return rows

@@ -64,18 +64,16 @@ def _tuned(cycles: int, torque: float, k: float, c: float) -> tuple[float, Orbit
     closed = closed_form_orbits(figure_scene(ratio, restitution=k), cycles=cycles)
     kappa, slope, before = FREQUENCY_RATIO, 1.0, None
     guess = _machine(torque, kappa, k, c).start(Y=closed.Y[0], V=closed.V[0], W=FREQUENCY_RATIO)
-    orbit = None
     for _ in range(8):
-        orbit = find_orbit(_machine(torque, kappa, k, c), guess, cycles=cycles)
+        orbit = find_orbit(_machine(torque, kappa, k, c), guess, cycles=cycles, throw=True)
         off = mean_ratio(orbit) - FREQUENCY_RATIO
         if abs(off) < _TUNED:
-            break
+            return kappa, orbit
         if before is not None and kappa != before[0]:  # secants
             slope = (off - before[1]) / (kappa - before[0])
         before = kappa, off
         kappa, guess = kappa - off / slope, orbit.state
-    assert orbit is not None
-    return kappa, orbit
+    raise RuntimeError("No κ gives the motion its frequency ratio.")
 
 
 def _run(torque: float, kappa: float, **start: Any) -> Run:

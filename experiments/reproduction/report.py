@@ -2,7 +2,7 @@
 
 import json
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -25,7 +25,7 @@ from .motors import draw_motors, simulate_motors
 from .pages import Findings, as_json, as_markdown
 from .response import response
 from .response_figure import LOOK, draw_response
-from .rows import Claim
+from .rows import Row
 
 KEPT = Path(__file__).parent / "report" / "report.json"
 """The report of an earlier run, with which each run is compared."""
@@ -84,7 +84,7 @@ def _findings(out: Path, figure_2: Callable[[], Any]) -> Findings:
     return Findings(cases, claims, faults, rows, panels, describe_boundaries(curves))
 
 
-def _figure_2(out: Path) -> tuple[dict[str, Any], list[Claim], dict[str, Boundary]]:
+def _figure_2(out: Path) -> tuple[dict[str, Any], list[Row], dict[str, Boundary]]:
     """Draw Figure 2 into a folder; return its panels, its claims, and the curves of 4π motions,
     which begin on its branches."""
     found = response()
@@ -93,12 +93,6 @@ def _figure_2(out: Path) -> tuple[dict[str, Any], list[Claim], dict[str, Boundar
     branches = [branch for system in found.systems for branch in system.branches]
     curves = follow_curves([name for name, at in CURVES.items() if at[0] == 2], branches)
     return panels, check_figure_2(found, panels["panels"]), curves
-
-
-def summary(claims: Sequence[Claim]) -> str:
-    """Return a line for each claim."""
-    width = max(len(claim.verdict) for claim in claims)
-    return "\n".join(f"  {claim.verdict:<{width}}  {claim.name}" for claim in claims)
 
 
 def differences(new: dict[str, Any], kept: dict[str, Any]) -> list[str]:
