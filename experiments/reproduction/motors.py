@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from tools.pictures import panels
 from vi_jax.flow import Run, simulate
 from vi_jax.machines import Parameters, Scene
 from vi_jax.orbit import Orbit, closed_form_orbits, find_orbit
@@ -98,9 +99,7 @@ def simulate_motors() -> tuple[list[TableRow], list[MotorRun]]:
 
 def draw_motors(motors: Sequence[MotorRun], ideal: Run) -> Figure:
     """Draw the last 8π from rest with each motor, and with the ideal drive, above crank speeds."""
-    figure = Figure(figsize=(14, 6.6), dpi=110)
-    figure.set_layout_engine("constrained", w_pad=0.08)
-    grid = figure.subplots(2, len(motors), sharex=True, sharey="row")
+    figure, grid = panels(14, 6.6, 2, len(motors), w_pad=0.08, sharex=True, sharey="row")
     last = slice(-4 * SAMPLES - 1, None)
     place = np.linspace(0, 8, 4 * SAMPLES + 1)
     assert ideal.samples is not None
