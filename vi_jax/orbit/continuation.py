@@ -38,7 +38,7 @@ from .kinds import CROSSING, FOLD, FOLLOWED, SLIDING, SYMMETRY, TOUCHING, with_a
 from .results import ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
 from .sliding import change_at, without_part
 from .special import Point
-from .tolerances import ALIKE, ROUNDING
+from .tolerances import ALIKE, FAINT, ROUNDING
 from .walk import check_walk, follow_both_ways, rescaled
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
@@ -252,11 +252,6 @@ def _refine(problem: Shooting, x: np.ndarray, tangent: np.ndarray) -> tuple[Step
     return start, distance if bool(start.good) else np.inf
 
 
-# A curve begins in the plane of constant second parameter if its unit tangent (scaled) has at least
-# this component along that parameter: a choice.
-_STEEP = 1e-3
-
-
 def boundary(
     point: Point,
     *,
@@ -298,7 +293,7 @@ def boundary(
 
     # The second parameter rises ahead. If it hardly does, the tangent needs another program.
     start = advance(problem, x, np.eye(x.size)[-2], 0.0)
-    if not bool(start.good) or start.tangent[-2] < _STEEP:
+    if not bool(start.good) or start.tangent[-2] < FAINT:
         tangent = tangent_at(problem, x)
         start = advance(problem, x, tangent * np.copysign(1.0, tangent[-2]), 0.0)
     if not bool(start.good):

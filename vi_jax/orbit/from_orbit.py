@@ -144,11 +144,6 @@ def with_widths(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Sho
 # number: a choice.
 _MOST = 4096
 
-# Doubling the steps changes the states of a point of a curve by less than this. It is above the
-# corrector's tolerance and below the promised accuracy of special points.
-COARSE = 1e-10
-
-
 # A component of the state below the first share of its expected size at events, or below the second
 # along the whole motion, gets that size. Both are choices; the second is above the remainder of a
 # component that decays to zero. If all are zero to rounding, at rest, the size is 1.
@@ -519,7 +514,7 @@ def resting_problem_of(
     x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)], begins[-1]))
     problem = with_sizes(problem, x)
     error = step_error(problem, x) if steps_depend_on_motion(problem) else 0.0
-    if error > COARSE:
+    if error > 10 * CORRECTED:
         problem = with_finer_steps(problem, x, error) or problem
     return problem, x
 

@@ -21,7 +21,6 @@ from .corrector import method_of_runs, on_host
 from .equations import Shooting
 from .flight import Event
 from .forecast import (
-    REPEATS,
     SCENARIOS,
     SOUGHT,
     Attractors,
@@ -39,7 +38,7 @@ from .forecast import (
 from .local_map import LocalGrazing, graze_at
 from .results import multipliers_in_words
 from .special import Point
-from .tolerances import CORRECTED
+from .tolerances import ALIKE, CORRECTED
 
 # A motion on the section farther off than so many of the deepest kicks has left: a choice.
 _KICKS_SUMMED = 64
@@ -99,7 +98,7 @@ def simulate_attractors(graze: LocalGrazing, offsets: np.ndarray) -> SimulatedAt
     is_away = np.abs(displacements).max(axis=(1, 2)) > kick_sum.max() * deepest + rounding
     is_finite = is_finite & np.isfinite(displacements).all(axis=(1, 2))
     span = np.abs(displacements).max(axis=(1, 2), initial=0.0, where=np.isfinite(displacements))
-    far = np.where(is_finite & is_away, periods_in(displacements, hits, REPEATS * span), 0)
+    far = np.where(is_finite & is_away, periods_in(displacements, hits, ALIKE * span), 0)
     period = np.where(is_finite & ~is_away, period, -1)
     rigid = all(touch.number < len(stops_of(problem.machine)) for touch in graze.touches)
     touch_impacts = impacts_in(hits, period) if rigid else np.full(len(period), np.nan)
