@@ -21,6 +21,7 @@ from .corrector import method_of_runs, on_host
 from .equations import Shooting
 from .flight import Event
 from .forecast import (
+    LONGEST,
     SCENARIOS,
     SOUGHT,
     Attractors,
@@ -39,9 +40,6 @@ from .local_map import LocalGrazing, graze_at
 from .results import multipliers_in_words
 from .special import Point
 from .tolerances import ALIKE, CORRECTED
-
-# A motion on the section farther off than so many of the deepest kicks has left: a choice.
-_KICKS_SUMMED = 64
 
 
 class SimulatedAttractors(NamedTuple):
@@ -87,7 +85,7 @@ def simulate_attractors(graze: LocalGrazing, offsets: np.ndarray) -> SimulatedAt
     hits = impacts.reshape(len(rows), SOUGHT, problem.cycles).sum(axis=2) - len(problem.impacts)
     size = kick_sizes(local, offsets)
     u, kick_sum = local.kicks.T, np.zeros(len(section.state))
-    for _ in range(_KICKS_SUMMED):
+    for _ in range(LONGEST):  # farther off than the sum of so many kicks a motion has left
         kick_sum += np.abs(section.matrix @ u).max(axis=1)
         u = local.matrix @ u
     unit = np.abs(local.kicks).max()

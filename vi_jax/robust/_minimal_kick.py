@@ -28,7 +28,7 @@ from .._messages import at_work
 from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, components, in_rows, state_in_words, units_of
-from ..orbit import CORRECTED, FAINT, Orbit, cycle_map
+from ..orbit import CORRECTED, FAINT, LOCATED, Orbit, cycle_map
 from ._edge_state import EdgeState, track_edge
 from ._settling import ELSEWHERE, RETURNS, Row, Rows, Settling, images, settling_on
 
@@ -330,9 +330,6 @@ def _newton(edge: Callable[[Kicks], tuple[Row, Kicks]], z: Row) -> tuple[Row, fl
     return None
 
 
-# Simulations with the kick larger and smaller by this share confirm it.
-_MARGIN = 1e-6
-
 # Rounds of refinement around the best rays: before Newton's method, and instead of it. Choices: the
 # latter narrow a turn of 1/128 to 1e-8.
 _FEW_ROUNDS, _MANY_ROUNDS = 2, 14
@@ -501,7 +498,7 @@ def _exact(
     line = Exits(unit[None], np.array([inside]), np.array([outside]))
     line = narrowed(settling, kick, line, _ALL_BITS)
     outside = float(line.outside[0])
-    ends = kick.rows(np.array([line.inside[0], outside * (1 + _MARGIN)])[:, None] * unit)
+    ends = kick.rows(np.array([line.inside[0], outside * (1 + LOCATED)])[:, None] * unit)
     if settling.begin > 0:
         ends = settling.states_after(ends, 1)
     edge = track_edge(settling.starting_at(0.0), ends[0], ends[1], longest, _ROUNDS)
@@ -556,7 +553,7 @@ def _described(
     settling: Settling, kick: Kick, found: _Found, longest: int, cycle: int, phase: float
 ) -> MinimalKick:
     z, residual, is_exact, edge = found
-    rows = kick.rows(np.array([1 - _MARGIN, 1 + _MARGIN])[:, None] * z)
+    rows = kick.rows(np.array([1 - LOCATED, 1 + LOCATED])[:, None] * z)
     verdicts = settling.judge(rows)
     row = kick.rows(z)
     changed = components(settling.state(row - kick.start))
