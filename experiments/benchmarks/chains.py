@@ -32,7 +32,6 @@ import numpy as np
 import vi_jax as vi
 from vi_jax.plot.colors import BLUE, GREEN, RED
 
-jax.config.update("jax_enable_x64", True)
 # Without this, heyoka would reuse compiled code of an earlier run.
 hy.llvm_state.set_diskcache_enabled(False)
 

@@ -32,8 +32,6 @@ import numpy as np
 import vi_jax as vi
 from vi_jax.plot.colors import BLUE, GREEN
 
-jax.config.update("jax_enable_x64", True)
-
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.networks import flat, last_places, oscillator
 from tools.pictures import open_frames, panels

@@ -15,9 +15,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
-import jax
 
-jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi

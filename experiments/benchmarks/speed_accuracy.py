@@ -22,7 +22,6 @@ from pathlib import Path
 import jax
 import numpy as np
 
-jax.config.update("jax_enable_x64", True)
 # Single precision is used on purpose.
 warnings.filterwarnings("ignore", message="vi_jax is running in single precision")
 warnings.filterwarnings("ignore", message="[0-9,]+ of [0-9,]+ lanes failed")

@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tools.kept import keep_programs
 
-from reproduction.report import KEPT, differences, read, reproduce, summary
+from reproduction.report import KEPT, differences, read, reproduce
 
 
 def main() -> int:
@@ -32,7 +32,8 @@ def main() -> int:
     except OSError as error:  # the folder cannot be written to
         parser.exit(1, f"{error}\n")
     print("Claims and assumptions of the paper (Figures 3 and 4: ζ = 0.90, k = 0.50, Δ = 2a):")
-    print(summary(found.claims))
+    for claim in found.claims:
+        print(f"  {claim.verdict:<25}{claim.name}")
     print(f"{len(found.faults)} faults of the printed text, with their numbers: report.md")
     print(f"Written to {out}: {', '.join(sorted(path.name for path in out.iterdir()))}")
     differing = differences(read(out / "report.json"), read(KEPT)) if KEPT.exists() else []

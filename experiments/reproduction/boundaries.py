@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy.interpolate import CubicSpline
 from tools.ideal import births
-from tools.pictures import legend_below
+from tools.pictures import legend_below, panels
 from vi_jax.machines import Parameters, Scene
 from vi_jax.orbit import Boundary, Branch, boundary, closed_form_orbits, continue_orbit, find_orbit
 from vi_jax.plot import DASHES, color_of, paler
@@ -179,9 +179,7 @@ def describe_boundaries(curves: Curves) -> dict[str, float | None]:
 
 def draw_boundaries(curves: Curves) -> Figure:
     """Draw (ζ, k) above (ζ, c): the whole plane, and the region of the discrepancy."""
-    figure = Figure(figsize=(12.5, 9.6), dpi=110)
-    figure.set_layout_engine("constrained", w_pad=0.08)
-    grid = figure.subplots(2, 2, width_ratios=(1.0, 1.25))
+    figure, grid = panels(12.5, 9.6, 2, 2, w_pad=0.08, width_ratios=(1.0, 1.25))
     for row, plane in zip(grid, "kc", strict=True):
         for ax, zoom in zip(row, (False, True), strict=True):
             _draw(ax, curves, plane, zoom)

@@ -25,7 +25,7 @@ from .motions import (
 )
 from .motors import MotorRun
 from .response import WALL, Response
-from .rows import PARTLY, Claim, claim, listed, verdict
+from .rows import PARTLY, Row, claim, listed, verdict
 
 # A motion counts as settled while it stays this close to an orbit (unit: a, a ω): a choice.
 _SETTLED = 1e-3
@@ -35,7 +35,7 @@ _PHASES = 8
 _NEAR = 0.3
 
 
-def check_claims(cases: tuple[Case, Case], panels: list[dict] | None = None) -> list[Claim]:
+def check_claims(cases: tuple[Case, Case], panels: list[dict] | None = None) -> list[Row]:
     """Measure each claim about Figures 3 and 4 on the simulated cases. Without the `panels` of
     Figure 2 (`describe`) the claim about the whole figure is tested at ζ = 0.90 only."""
     checks = (
@@ -45,12 +45,12 @@ def check_claims(cases: tuple[Case, Case], panels: list[dict] | None = None) -> 
     return [check(cases) for check in checks]
 
 
-def check_figure_2(found: Response, panels: list[dict]) -> list[Claim]:
+def check_figure_2(found: Response, panels: list[dict]) -> list[Row]:
     """Measure each claim about the whole of Figure 2, whose panels `describe` returns."""
     return [_free(found), *(check(panels) for check in (_everywhere, _reason, _wall))]
 
 
-def check_assumptions(case: Case, motors: list[MotorRun]) -> list[Claim]:
+def check_assumptions(case: Case, motors: list[MotorRun]) -> list[Row]:
     """Measure the assumptions on the undamped case, and those about the motor on its runs."""
     return [_crank_phase(case), _cosine(case), _motor(motors), _even_speed(case, motors)]
 

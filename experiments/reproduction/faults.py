@@ -9,16 +9,16 @@ from vi_jax.orbit import closed_form_orbits
 
 from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, figure_scene
 from .printed import energy_drift, eq21_misses
-from .rows import Fault, fault, listed
+from .rows import Row, fault, listed
 
 
-def check_faults() -> list[Fault]:
+def check_faults() -> list[Row]:
     """Measure each fault of the printed text."""
     checks = (
         _inertia_term, _coupling, _phase, _no_load_speed, _captions, _damping, _lever, _disc,
         _lines,
     )  # fmt: skip
-    return [check(number) for number, check in enumerate(checks, 1)]
+    return [check(number=number) for number, check in enumerate(checks, 1)]
 
 
 def _drift(**printed: float) -> float:

@@ -6,23 +6,19 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from tools.pictures import legend_below, save_picture
+from tools.pictures import legend_below, panels, save_picture
 from vi_jax.flow import Run
 from vi_jax.plot import STOP, angle_axis, color_of, motion_path, plot_history
 
 from .motions import Case
 
-# Dots per inch: a choice.
-_DPI = 110
 # The colour of a simulated motion is neutral, because the picture is to show its regime.
 _INK = "0.2"
 
 
 def draw_figure(number: int, cases: tuple[Case, Case], path: Path) -> None:
     """Draw Figure 3 (from rest) or 4 (from the 4π state) of the paper into a PNG file."""
-    figure = Figure(figsize=(14, 8.4), dpi=_DPI)
-    figure.set_layout_engine("constrained", w_pad=0.08)
-    grid = figure.subplots(2, 3, sharey=True)
+    figure, grid = panels(14, 8.4, 2, 3, w_pad=0.08, sharey=True)
     for row, case in zip(grid, cases, strict=True):
         _draw_row(number, case, list(row))
     begins = "from rest (Y = V = 0)" if number == 3 else "from the 4π state fitted by optax"
@@ -31,7 +27,7 @@ def draw_figure(number: int, cases: tuple[Case, Case], path: Path) -> None:
         fontsize=13,
     )
     common_legend(figure, grid[0, :2], 7)  # the undamped panels have every curve
-    save_picture(figure, path, dpi=_DPI, colors=64)
+    save_picture(figure, path, colors=64)
 
 
 def common_legend(figure: Figure, axes: np.ndarray, columns: int) -> None:

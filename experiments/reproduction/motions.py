@@ -114,15 +114,11 @@ def _alignment(from_rest: Run, orbit: Run) -> int:
     return int(abs(settled[even] - second) < abs(settled[even] - first))
 
 
-def sampled(run: Run) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return sampled Y and V with shape (cycles, samples), and the number of samples in a cycle."""
+def sampled(run: Run) -> np.ndarray:
+    """Return sampled Y and V, shape (2, cycles, samples)."""
     assert run.samples is not None
-    cycles = run.impacts.shape[0]
-    Y, V = (
-        np.asarray(x, float)[:-1].reshape(cycles, -1)
-        for x in (run.samples.state.Y, run.samples.state.V)
-    )
-    return Y, V, Y.shape[1]
+    state, cycles = run.samples.state, run.impacts.shape[0]
+    return np.stack([state.Y, state.V])[:, :-1].reshape(2, cycles, -1)
 
 
 def last_minima(run: Run) -> list[float]:
@@ -140,8 +136,8 @@ def closed_form(case: Case, cycles: int, period: int) -> np.ndarray:
 def half_turn_states(run: Run) -> np.ndarray:
     """Return (Y, V) at φ = π of each cycle, shape (cycles, 2). The impacts lie near φ = 0: states
     on a section there would be before the jump in some cycles and after it in others."""
-    Y, V, size = sampled(run)
-    return np.stack([Y[:, size // 2], V[:, size // 2]], axis=1)
+    both = sampled(run)
+    return both[:, :, both.shape[2] // 2].T
 
 
 class TableRow(NamedTuple):
@@ -180,5 +176,6 @@ def orbit_table(scenes: dict[str, Scene]) -> list[TableRow]:
             closed = closed_form_orbits(scene, cycles=cycles)
             if bool(closed.admissible[0]):
                 guess = scene.start(Y=closed.Y[0], V=closed.V[0])
-                rows.append(TableRow(f"ideal, {name}", find_orbit(scene, guess, cycles=cycles)))
+                orbit = find_orbit(scene, guess, cycles=cycles, throw=True)
+                rows.append(TableRow(f"ideal, {name}", orbit))
     return rows

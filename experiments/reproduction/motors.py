@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from tools.pictures import panels
 from vi_jax.flow import Run, simulate
 from vi_jax.machines import Parameters, Scene
 from vi_jax.orbit import Orbit, closed_form_orbits, find_orbit
@@ -64,18 +65,16 @@ def _tuned(cycles: int, torque: float, k: float, c: float) -> tuple[float, Orbit
     closed = closed_form_orbits(figure_scene(ratio, restitution=k), cycles=cycles)
     kappa, slope, before = FREQUENCY_RATIO, 1.0, None
     guess = _machine(torque, kappa, k, c).start(Y=closed.Y[0], V=closed.V[0], W=FREQUENCY_RATIO)
-    orbit = None
     for _ in range(8):
-        orbit = find_orbit(_machine(torque, kappa, k, c), guess, cycles=cycles)
+        orbit = find_orbit(_machine(torque, kappa, k, c), guess, cycles=cycles, throw=True)
         off = mean_ratio(orbit) - FREQUENCY_RATIO
         if abs(off) < _TUNED:
-            break
+            return kappa, orbit
         if before is not None and kappa != before[0]:  # secants
             slope = (off - before[1]) / (kappa - before[0])
         before = kappa, off
         kappa, guess = kappa - off / slope, orbit.state
-    assert orbit is not None
-    return kappa, orbit
+    raise RuntimeError("No κ gives the motion its frequency ratio.")
 
 
 def _run(torque: float, kappa: float, **start: Any) -> Run:
@@ -100,9 +99,7 @@ def simulate_motors() -> tuple[list[TableRow], list[MotorRun]]:
 
 def draw_motors(motors: Sequence[MotorRun], ideal: Run) -> Figure:
     """Draw the last 8π from rest with each motor, and with the ideal drive, above crank speeds."""
-    figure = Figure(figsize=(14, 6.6), dpi=110)
-    figure.set_layout_engine("constrained", w_pad=0.08)
-    grid = figure.subplots(2, len(motors), sharex=True, sharey="row")
+    figure, grid = panels(14, 6.6, 2, len(motors), w_pad=0.08, sharex=True, sharey="row")
     last = slice(-4 * SAMPLES - 1, None)
     place = np.linspace(0, 8, 4 * SAMPLES + 1)
     assert ideal.samples is not None

@@ -4,19 +4,18 @@ import json
 from typing import Any, NamedTuple
 
 from tools.tables import table
-from vi_jax.orbit import ORBIT_RESULTS
 
 from .discrepancy import motion_name, shares
 from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, Case, TableRow, mean_ratio
-from .rows import WORDS, Claim, Fault, listed
+from .rows import WORDS, Row, listed
 
 
 class Findings(NamedTuple):
     """The contents of the report."""
 
     cases: tuple[Case, Case]
-    claims: list[Claim]
-    faults: list[Fault]
+    claims: list[Row]
+    faults: list[Row]
     orbits: list[TableRow]
     panels: dict[str, Any]
     borders: dict[str, float | None]
@@ -36,8 +35,8 @@ def as_json(found: Findings) -> str:
         "closed_forms": {
             case.name: {"2pi": _orbit(case.short), "4pi": _orbit(case.long)} for case in cases
         },
-        "claims": [claim._asdict() for claim in found.claims],
-        "faults": [fault._asdict() for fault in found.faults],
+        "claims": [vars(claim) for claim in found.claims],
+        "faults": [vars(fault) for fault in found.faults],
         "orbits": [_found(row) for row in found.orbits],
         "figure_2": found.panels,
         "boundaries": found.borders,
@@ -65,8 +64,6 @@ def _pairs(numbers) -> list[list[float]]:
 
 def _found(row: TableRow) -> dict:
     orbit = row.orbit
-    if not bool(orbit.successful):
-        return {"scene": row.scene, "found": False, "reason": ORBIT_RESULTS[orbit.result]}
     return {
         "scene": row.scene,
         "found": True,
@@ -85,20 +82,17 @@ def _found(row: TableRow) -> dict:
 
 def _orbits(orbits: list[TableRow]) -> str:
     heads = "scene,κ,mean ζ,period,Y,V,min Y,V⁻,largest multiplier,stable,residual".split(",")
-    rows = []
-    for name, orbit, kappa in orbits:
-        if not bool(orbit.successful):
-            rows.append([name, "", "", "none found", *[""] * 6, f"{float(orbit.residual):.1e}"])
-            continue
-        rows.append([
+    return table(heads, [
+        [
             name, "–" if kappa is None else f"{kappa:.6f}", f"{mean_ratio(orbit):.6f}",
             f"{2 * int(orbit.cycles)}π",
             *(f"{float(x):.6f}" for x in (orbit.state.Y, orbit.state.V, orbit.y_min)),
             listed("{:.5f}", map(float, orbit.impact_speed), ", "),
             f"{abs(complex(orbit.multipliers[0])):.6f}", "yes" if orbit.stable else "no",
             f"{float(orbit.residual):.0e}",
-        ])  # fmt: skip
-    return table(heads, rows)
+        ]
+        for name, orbit, kappa in orbits
+    ])  # fmt: skip
 
 
 def _response(panels: list[dict[str, Any]]) -> dict[str, str]:

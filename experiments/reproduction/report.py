@@ -2,14 +2,13 @@
 
 import json
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-from tools.pictures import save_picture
+from tools.pictures import panels, save_picture
 from tools.study import say
 from vi_jax.machines import Parameters
 from vi_jax.orbit import Boundary
@@ -25,7 +24,7 @@ from .motors import draw_motors, simulate_motors
 from .pages import Findings, as_json, as_markdown
 from .response import response
 from .response_figure import LOOK, draw_response
-from .rows import Claim
+from .rows import Row
 
 KEPT = Path(__file__).parent / "report" / "report.json"
 """The report of an earlier run, with which each run is compared."""
@@ -55,8 +54,8 @@ def _findings(out: Path, figure_2: Callable[[], Any]) -> Findings:
     say("simulating, undamped and damped")
     cases = simulate_cases()
     say("drawing Figures 1, 3 and 4")
-    figure = Figure(figsize=(12, 5), layout="constrained")
-    plot_sketch(Parameters().scene(), ax=figure.subplots())
+    figure, ax = panels(12, 5)
+    plot_sketch(Parameters().scene(), ax=ax)
     save_picture(figure, out / "fig1.png")
     for number in (3, 4):
         draw_figure(number, cases, out / f"fig{number}.png")
@@ -75,30 +74,24 @@ def _findings(out: Path, figure_2: Callable[[], Any]) -> Findings:
     say("following the boundaries of the discrepancy")
     curves = follow_curves([name for name, at in CURVES.items() if at[0] == 1])
     say("waiting for Figure 2, which a second process computes")
-    panels, figure_2_claims, long_curves = figure_2()
+    found, figure_2_claims, long_curves = figure_2()
     curves |= long_curves
     save_picture(draw_boundaries(curves), out / "boundaries.png")
-    claims = check_claims(cases, panels["panels"]) + figure_2_claims
+    claims = check_claims(cases, found["panels"]) + figure_2_claims
     claims += check_assumptions(cases[0], motors)
     rows = orbits + motor_orbits
-    return Findings(cases, claims, faults, rows, panels, describe_boundaries(curves))
+    return Findings(cases, claims, faults, rows, found, describe_boundaries(curves))
 
 
-def _figure_2(out: Path) -> tuple[dict[str, Any], list[Claim], dict[str, Boundary]]:
+def _figure_2(out: Path) -> tuple[dict[str, Any], list[Row], dict[str, Boundary]]:
     """Draw Figure 2 into a folder; return its panels, its claims, and the curves of 4π motions,
     which begin on its branches."""
     found = response()
-    panels = describe(found)
-    save_picture(draw_response(found, panels["panels"]), out / "fig2.png", **LOOK)
+    described = describe(found)
+    save_picture(draw_response(found, described["panels"]), out / "fig2.png", **LOOK)
     branches = [branch for system in found.systems for branch in system.branches]
     curves = follow_curves([name for name, at in CURVES.items() if at[0] == 2], branches)
-    return panels, check_figure_2(found, panels["panels"]), curves
-
-
-def summary(claims: Sequence[Claim]) -> str:
-    """Return a line for each claim."""
-    width = max(len(claim.verdict) for claim in claims)
-    return "\n".join(f"  {claim.verdict:<{width}}  {claim.name}" for claim in claims)
+    return described, check_figure_2(found, described["panels"]), curves
 
 
 def differences(new: dict[str, Any], kept: dict[str, Any]) -> list[str]:

@@ -9,6 +9,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from tools.pictures import panels
 from vi_jax.plot import MORE_IMPACTS, STOP, color_of, mark_of, paler, plot_branch
 from vi_jax.scans import REGIMES
 
@@ -29,16 +30,14 @@ _DOWN: dict[str, Any] = {
 }  # fmt: skip
 
 
-def draw_response(found: Response, panels: list[dict]) -> Figure:
+def draw_response(found: Response, described: list[dict]) -> Figure:
     """Draw Figure 2: above the whole range of ζ, undamped and damped; below from BB' to CC'."""
     titles = ["undamped, ξ = 0", f"Table 1, ξ = {found.systems[1].damping_ratio:.4f}"]
-    figure = Figure(figsize=(15, 17.2))
-    figure.set_layout_engine("constrained", w_pad=0.08)
-    grid = figure.subplots(4, 2)
-    colors = _colors(panels)
+    figure, grid = panels(15, 17.2, 4, 2, w_pad=0.08)
+    colors = _colors(described)
     for column, k in enumerate(RESTITUTIONS):
         for row, title in enumerate(titles):
-            system, panel = found.systems[2 * column + row], panels[2 * column + row]
+            system, panel = found.systems[2 * column + row], described[2 * column + row]
             _whole(grid[row, column], found, system)
             name = f"{'ab'[column]}) " if not row else ""
             grid[row, column].set_title(f"{name}k = {k:g}, d = 2, {title}", fontsize=12)

@@ -3,7 +3,8 @@
 import tomllib
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 CONFIRMED, UNDAMPED_ONLY, CONTRADICTED = "confirmed", "confirmed undamped only", "contradicted"
 PARTLY = "confirmed in part"
@@ -11,51 +12,34 @@ WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding=
 """The words of the report, which are templates for `str.format`."""
 
 
-class Claim(NamedTuple):
-    """One claim or assumption of the paper, and its place there."""
+Row = SimpleNamespace
+"""A row of the report: the columns of its kind and its `numbers`; that of a claim has a `verdict`,
+that of a fault a `number`."""
 
-    name: str
-    place: str
-    claimed: str
-    measured: str
-    verdict: str
-    numbers: dict[str, Any]
-
-
-class Fault(NamedTuple):
-    """One fault of the printed text, and its place there."""
-
-    number: int
-    place: str
-    printed: str
-    right: str
-    measured: str
-    numbers: dict[str, Any]
+_COLUMNS = {
+    "claims": ("name", "place", "claimed", "measured"),
+    "faults": ("place", "printed", "right", "measured"),
+}
 
 
-def _filled(group: str, measure: Callable, further: dict, numbers: dict) -> list[str]:
-    row = WORDS[group][measure.__name__.removeprefix("_")]
-    return [words.format(**numbers, **further) for words in row]
+def _rows_of(kind: str) -> Callable[[Callable], Callable[..., Row]]:
+    """Return the decorator that makes a row of this kind of a measurement. That returns further
+    values for the words, the verdict on a claim, and numbers."""
+
+    def decorated(measure: Callable) -> Callable[..., Row]:
+        def check(*found: Any, **first: Any) -> Row:
+            further, *judged, numbers = measure(*found)
+            words = WORDS[kind][measure.__name__.removeprefix("_")]
+            filled = [x.format(**numbers, **further) for x in words]
+            columns = dict(zip((*_COLUMNS[kind], "verdict"), [*filled, *judged], strict=False))
+            return Row(**first, **columns, numbers=numbers)
+
+        return check
+
+    return decorated
 
 
-def claim(measure: Callable) -> Callable[..., Claim]:
-    """Make a row of a measurement that returns further values for the words, verdict, numbers."""
-
-    def check(*found: Any) -> Claim:
-        further, verdict, numbers = measure(*found)
-        return Claim._make([*_filled("claims", measure, further, numbers), verdict, numbers])
-
-    return check
-
-
-def fault(measure: Callable) -> Callable[[int], Fault]:
-    """Make a numbered row of a measurement that returns further values for the words, numbers."""
-
-    def check(number: int) -> Fault:
-        further, numbers = measure()
-        return Fault._make([number, *_filled("faults", measure, further, numbers), numbers])
-
-    return check
+claim, fault = _rows_of("claims"), _rows_of("faults")
 
 
 def verdict(holds: bool, entirely: bool = True, otherwise: str = UNDAMPED_ONLY) -> str:

@@ -29,8 +29,6 @@ from matplotlib.lines import Line2D
 from scipy.optimize import brentq
 from vi_jax.plot.colors import RED, color_of, mark_of, mark_style
 
-jax.config.update("jax_enable_x64", True)
-
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.ideal import GAP, machine
 from tools.study import QUICK, say, write

@@ -27,8 +27,6 @@ import vi_jax as vi
 from vi_jax.plot import motion_path
 from vi_jax.plot.colors import BLUE, ORANGE, RED
 
-jax.config.update("jax_enable_x64", True)
-
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.pictures import gridded, panels
 from tools.study import QUICK, say, write

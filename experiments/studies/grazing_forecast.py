@@ -28,8 +28,6 @@ from matplotlib.ticker import NullFormatter
 from vi_jax.machine import leaf, with_leaf
 from vi_jax.plot.colors import BLUE, GREEN, ORANGE, RED
 
-jax.config.update("jax_enable_x64", True)
-
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.pictures import legend_below, open_frames
 from tools.study import QUICK, say, write

@@ -22,8 +22,6 @@ import numpy as np
 import vi_jax as vi
 from vi_jax.plot.colors import BLUE
 
-jax.config.update("jax_enable_x64", True)
-
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.ideal import vibration
 from tools.pictures import gridded, panels

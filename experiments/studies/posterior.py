@@ -27,8 +27,6 @@ from matplotlib.figure import Figure
 from scipy.stats import binom, kstest
 from vi_jax.plot.colors import BLUE, ORANGE, STOP, paler
 
-jax.config.update("jax_enable_x64", True)
-
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.study import QUICK, say, write
 from tools.tables import table

@@ -16,7 +16,6 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 import vi_jax as vi
 import xarray as xr
@@ -24,8 +23,6 @@ from matplotlib import patheffects
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from vi_jax.plot.colors import DASHES
-
-jax.config.update("jax_enable_x64", True)
 
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from reproduction.boundaries import CURVES, TABLE_DAMPING, follow_curves, plane_points, xi_per_c

@@ -19,8 +19,6 @@ import numpy as np
 import vi_jax as vi
 from scipy.optimize import brentq
 
-jax.config.update("jax_enable_x64", True)
-
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.pictures import open_frames, panels
 from tools.study import QUICK, write

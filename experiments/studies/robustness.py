@@ -12,11 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import vi_jax as vi
-
-jax.config.update("jax_enable_x64", True)
 
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.pictures import open_frames, panels

@@ -31,9 +31,13 @@ def legend_below(figure: Any, handles: Iterable[Any], columns: int, **look: Any)
     figure.legend(handles=list(handles), loc="outside lower center", ncols=columns, **look)
 
 
-def panels(width: float, height: float, *grid: int, **look: Any) -> tuple[Figure, Any]:
-    """Return a figure of a size in inches, and its panels as `Figure.subplots` returns them."""
-    figure = Figure(figsize=(width, height), layout="constrained")
+def panels(
+    width: float, height: float, *grid: int, w_pad: float | None = None, **look: Any
+) -> tuple[Figure, Any]:
+    """Return a figure of a size in inches, and its panels as `Figure.subplots` returns them, with
+    so many inches beside each."""
+    figure = Figure(figsize=(width, height))
+    figure.set_layout_engine("constrained", w_pad=w_pad)
     return figure, figure.subplots(*grid, **look)
 
 

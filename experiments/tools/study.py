@@ -1,7 +1,7 @@
 """The frame of a study: its `--quick` option, its progress lines, its page and its picture.
 
 A study's page ends with its headline numbers as JSON. A test computes them again with the current
-library.
+library. All studies are in double precision.
 """
 
 import json
@@ -11,11 +11,13 @@ import time
 from pathlib import Path
 from typing import Any
 
+import jax
 from matplotlib.figure import Figure
 
 from .kept import keep_programs
 from .pictures import save_picture
 
+jax.config.update("jax_enable_x64", True)
 QUICK = "--quick" in sys.argv
 """True if the study takes few values and writes nothing."""
 

@@ -20,8 +20,9 @@ from .results import (
 from .root_finders import AbstractRootFinder, Gradient, Newton
 from .special import Point
 from .birkhoff import (
-    QUASIPERIODIC, WANDERS, agreement, digits_of, rotation_number, without_angles,
+    QUASIPERIODIC, WANDERS, agreement, digits_of, rotation_number, weights, without_angles,
 )
+from .tolerances import ALIKE, CORRECTED, FAINT, LOCATED, ROUNDINGS
 from .torus import Torus, find_torus
 from .torus_branch import TorusBranch, Window, continue_torus
 from . import switch  # registers what begins at special points

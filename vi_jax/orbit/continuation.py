@@ -10,7 +10,6 @@ import numpy as np
 
 from .._checks import (
     flag,
-    from_host,
     given_number,
     instance_of,
     interval,
@@ -29,17 +28,17 @@ from .equations import Shooting
 from .from_orbit import (
     ADVICE,
     check_parameter,
-    cycles_to_fly,
     problem_of,
     resting_problem_of,
-    steps_of,
+    with_parameters,
     with_sizes,
+    with_widths,
 )
 from .kinds import CROSSING, FOLD, FOLLOWED, SLIDING, SYMMETRY, TOUCHING, with_article
 from .results import ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
 from .sliding import change_at, without_part
 from .special import Point
-from .tolerances import ALIKE, ROUNDING
+from .tolerances import ALIKE, FAINT, ROUNDING
 from .walk import check_walk, follow_both_ways, rescaled
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
@@ -165,7 +164,7 @@ def _extend(
 ) -> tuple[Shooting, np.ndarray, list[tuple[float, float]]]:  # fmt: skip
     """Add parameters and as many conditions; return equations, unknowns and intervals."""
     if not free:
-        return _with_widths(problem, [bounds]), x, [bounds]
+        return with_widths(problem, [bounds]), x, [bounds]
     machine, parameter_values, ranges = problem.machine, [], []
     for name, given in free.items():
         check_leaf(machine, name, argument="free")
@@ -184,17 +183,8 @@ def _extend(
                 f"Argument `fixed` must name what the orbit has, but its {name} is {target:g}."
             )
     new = dataclasses.replace(problem, conditions=hold_values(targets, multipliers))
-    new = _with_parameters(new, x, tuple(free), ranges := [*ranges, bounds])
+    new = with_parameters(new, x, tuple(free), ranges := [*ranges, bounds])
     return new, np.concatenate([x[:-1], parameter_values, x[-1:]]), ranges
-
-
-def _with_parameters(
-    problem: Shooting, x: np.ndarray, names: tuple[str, ...], ranges: Sequence[tuple[float, float]]
-) -> Shooting:
-    """Put these parameters before the equations' own, with steps for all their intervals."""
-    new = dataclasses.replace(problem, parameters=(*names, *problem.parameters))
-    steps = steps_of(problem.method, new.corners(ranges), problem.like, cycles_to_fly(problem, x))
-    return _with_widths(dataclasses.replace(new, steps=max(problem.steps, steps)), ranges)
 
 
 def _check_names(argument: str, names: str | Sequence[str], problem: Shooting) -> tuple[str, ...]:
@@ -215,12 +205,6 @@ def _check_watched(
         if value.ndim or value.dtype.kind not in "fiu":
             raise TypeError(f"Argument `watch` must give numbers, but {name!r} gives {value!r}.")
     return watch
-
-
-def _with_widths(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Shooting:
-    """Set the sizes of the parameters, half the widths of their intervals."""
-    widths = from_host(np.array([0.5 * (high - low) for low, high in ranges]))
-    return dataclasses.replace(problem, widths=widths)
 
 
 def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> tuple[Shooting, Step]:
@@ -268,11 +252,6 @@ def _refine(problem: Shooting, x: np.ndarray, tangent: np.ndarray) -> tuple[Step
     return start, distance if bool(start.good) else np.inf
 
 
-# A curve begins in the plane of constant second parameter if its unit tangent (scaled) has at least
-# this component along that parameter: a choice.
-_STEEP = 1e-3
-
-
 def boundary(
     point: Point,
     *,
@@ -314,7 +293,7 @@ def boundary(
 
     # The second parameter rises ahead. If it hardly does, the tangent needs another program.
     start = advance(problem, x, np.eye(x.size)[-2], 0.0)
-    if not bool(start.good) or start.tangent[-2] < _STEEP:
+    if not bool(start.good) or start.tangent[-2] < FAINT:
         tangent = tangent_at(problem, x)
         start = advance(problem, x, tangent * np.copysign(1.0, tangent[-2]), 0.0)
     if not bool(start.good):
@@ -384,7 +363,7 @@ def _special_motion(point: Point, parameter: str, bounds: Intervals) -> tuple[Sh
     change = change_at(old, point.step) if point.kind in SLIDING else None
     if change is not None:  # with the vanishing part it could not be solved beyond the point
         old, start, impact = without_part(old, point.step, change)
-    problem = _with_parameters(old, start, (parameter,), bounds)
+    problem = with_parameters(old, start, (parameter,), bounds)
     values = float(leaf(old.machine, parameter)), point.parameter
     x = np.append(start[:-1], values)
     replacement = None

@@ -6,15 +6,10 @@ import numpy as np
 
 from ..flow import NamedEnumeration
 from .local_map import LocalMap
-from .tolerances import SAME
+from .tolerances import ALIKE, SAME
 
 # Longest period that is sought, and the number of iterates in which it is sought.
 LONGEST, SOUGHT = 64, 192
-
-# A motion is periodic if it repeats within this share of one kick: a choice, far above the rest of
-# the transient (`SAME`) and far below the differences of chaos. A distant one is periodic
-# within the square of it.
-REPEATS = 1e-3
 
 # A motion beyond so many kicks does not return: a choice.
 _LOST = 1e9
@@ -73,12 +68,13 @@ class Attractors(NamedTuple):
 
 def periods_in(rows: np.ndarray, hits: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Return the least period of each lane up to `LONGEST`, or 0. `rows` (lanes, length,
-    components) must repeat to a share of a kick's `size`, `hits` (impacts per iterate) exactly."""
+    components) must repeat to a share `ALIKE` of a kick's `size`, `hits` (impacts per iterate)
+    exactly."""
     found = np.zeros(len(rows), int)
     for p in range(LONGEST, 0, -1):
         differences = np.abs(rows[:, p:] - rows[:, :-p]).max(axis=(1, 2))
         same_hits = (hits[:, p:] == hits[:, :-p]).all(axis=1)
-        found = np.where(same_hits & (differences <= REPEATS * size), p, found)
+        found = np.where(same_hits & (differences <= ALIKE * size), p, found)
     return found
 
 

@@ -125,14 +125,24 @@ def cycles_to_fly(problem: Shooting, x: Unknowns) -> int:
     return longest_leg(places, problem.events, period, problem.cycles)
 
 
+def with_parameters(
+    problem: Shooting, x: Unknowns, names: tuple[str, ...], ranges: Sequence[tuple[float, float]]
+) -> Shooting:
+    """Put these parameters before the equations' own, with steps for all their intervals."""
+    new = dataclasses.replace(problem, parameters=(*names, *problem.parameters))
+    steps = steps_of(problem.method, new.corners(ranges), problem.like, cycles_to_fly(problem, x))
+    return with_widths(dataclasses.replace(new, steps=max(problem.steps, steps)), ranges)
+
+
+def with_widths(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Shooting:
+    """Set the sizes of the parameters, half the widths of their intervals."""
+    widths = from_host(np.array([0.5 * (high - low) for low, high in ranges]))
+    return dataclasses.replace(problem, widths=widths)
+
+
 # Steps are doubled until the end of a flight changes by less than `CORRECTED`, or up to this
 # number: a choice.
 _MOST = 4096
-
-# Doubling the steps changes the states of a point of a curve by less than this. It is above the
-# corrector's tolerance and below the promised accuracy of special points.
-COARSE = 1e-10
-
 
 # A component of the state below the first share of its expected size at events, or below the second
 # along the whole motion, gets that size. Both are choices; the second is above the remainder of a
@@ -504,7 +514,7 @@ def resting_problem_of(
     x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)], begins[-1]))
     problem = with_sizes(problem, x)
     error = step_error(problem, x) if steps_depend_on_motion(problem) else 0.0
-    if error > COARSE:
+    if error > 10 * CORRECTED:
         problem = with_finer_steps(problem, x, error) or problem
     return problem, x
 

@@ -21,7 +21,7 @@ from .corrector import method_of_runs, on_host
 from .equations import Shooting
 from .flight import Event
 from .forecast import (
-    REPEATS,
+    LONGEST,
     SCENARIOS,
     SOUGHT,
     Attractors,
@@ -39,10 +39,7 @@ from .forecast import (
 from .local_map import LocalGrazing, graze_at
 from .results import multipliers_in_words
 from .special import Point
-from .tolerances import CORRECTED
-
-# A motion on the section farther off than so many of the deepest kicks has left: a choice.
-_KICKS_SUMMED = 64
+from .tolerances import ALIKE, CORRECTED
 
 
 class SimulatedAttractors(NamedTuple):
@@ -88,7 +85,7 @@ def simulate_attractors(graze: LocalGrazing, offsets: np.ndarray) -> SimulatedAt
     hits = impacts.reshape(len(rows), SOUGHT, problem.cycles).sum(axis=2) - len(problem.impacts)
     size = kick_sizes(local, offsets)
     u, kick_sum = local.kicks.T, np.zeros(len(section.state))
-    for _ in range(_KICKS_SUMMED):
+    for _ in range(LONGEST):  # farther off than the sum of so many kicks a motion has left
         kick_sum += np.abs(section.matrix @ u).max(axis=1)
         u = local.matrix @ u
     unit = np.abs(local.kicks).max()
@@ -99,7 +96,7 @@ def simulate_attractors(graze: LocalGrazing, offsets: np.ndarray) -> SimulatedAt
     is_away = np.abs(displacements).max(axis=(1, 2)) > kick_sum.max() * deepest + rounding
     is_finite = is_finite & np.isfinite(displacements).all(axis=(1, 2))
     span = np.abs(displacements).max(axis=(1, 2), initial=0.0, where=np.isfinite(displacements))
-    far = np.where(is_finite & is_away, periods_in(displacements, hits, REPEATS * span), 0)
+    far = np.where(is_finite & is_away, periods_in(displacements, hits, ALIKE * span), 0)
     period = np.where(is_finite & ~is_away, period, -1)
     rigid = all(touch.number < len(stops_of(problem.machine)) for touch in graze.touches)
     touch_impacts = impacts_in(hits, period) if rigid else np.full(len(period), np.nan)

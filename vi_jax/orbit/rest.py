@@ -21,19 +21,11 @@ from .._types import Flag, Scalar, State, Vector
 from ..flow import TIME, Integrals, Rates, force_rate, guard_rates, rounding_bounds
 from ..machine import RigidStop, push_of, stops_of
 from .flight import Flight, force_on
-from .tolerances import LOCATED, ROUNDING
+from .tolerances import FAINT, LOCATED, ROUNDING, ROUNDINGS
 
 # Most hops of a chatter, and most corrections of the landing of each: choices. With restitution
 # 0.95 a rebound has 1e-4 of the first speed after 180 hops.
 _HOPS, _CORRECTIONS = 400, 7
-
-# The remaining distance at a landing must exceed so many roundings of the stop's place, and those
-# of the body's: a choice.
-_ROUNDINGS = 10
-
-# A hop is the last one if its rebound is slower than this share of the fastest. Its error of third
-# order is then rounding, and its landing is accurate to a millionth of its duration.
-_SLOW = 1e-4
 
 # A chatter shorter than this share of the time until the release ends before it: a choice. At the
 # limit the share is 0.6 for each restitution.
@@ -56,7 +48,8 @@ class Chatter(NamedTuple):
 
 def last_hop(free: Flight, number: int, begin: Chatter, *, until: Scalar, steps: Scalar) -> Chatter:
     """Return the first impact of a chatter with a slow rebound, or the last one before the clock
-    `until`; `free` is the flight with the body free, `begin` the first impact."""
+    `until`; `free` is the flight with the body free, `begin` the first impact. The error of third
+    order of a hop slower than `FAINT` is rounding, and its landing is accurate to a millionth."""
     stop = stops_of(free.machine)[number]
     averages = tuple(name for name in begin.integrals if name != TIME)
 
@@ -66,11 +59,12 @@ def last_hop(free: Flight, number: int, begin: Chatter, *, until: Scalar, steps:
     def continues(carry: tuple[Chatter, Scalar, int]) -> Flag:
         hops, fastest, count = carry
         here = rates(hops.s, hops.u)
-        rounding = _ROUNDINGS * jnp.finfo(here.v.dtype).eps * jnp.abs(stop.place)
-        # A distance that is a function of several numbers has the rounding of all of them.
+        # The remaining distance at a landing must exceed roundings of the stop's place, and of the
+        # body's: a distance that is a function of several numbers has the rounding of all of them.
+        rounding = ROUNDINGS * jnp.finfo(here.v.dtype).eps * jnp.abs(stop.place)
         state = free.unravel(hops.u)
         rounding += rounding_bounds(free.machine, stop.coordinate, state, 0.0)[0]
-        fast = (-here.v > _SLOW * fastest) & (here.v**2 > rounding / LOCATED * jnp.abs(here.a))
+        fast = (-here.v > FAINT * fastest) & (here.v**2 > rounding / LOCATED * jnp.abs(here.a))
         return ~hops.is_over & (fast | (here.a < 0)) & (count < _HOPS)
 
     def hop(carry: tuple[Chatter, Scalar, int]) -> tuple[Chatter, Scalar, int]:

@@ -59,7 +59,7 @@ from ..machine import (
     without_history,
     without_modes,
 )
-from .tolerances import ROUNDING
+from .tolerances import ROUNDING, ROUNDINGS
 
 
 class STABILITY(NamedEnumeration):
@@ -71,10 +71,6 @@ class STABILITY(NamedEnumeration):
     neimark_sacker = "unstable: a complex pair outside the unit circle (past a Neimark–Sacker)"
     neutral = "neutral: neither stable nor unstable to rounding, a multiplier has modulus 1"
     unknown = "without multipliers"
-
-
-# A multiplier below so many roundings of the largest one, or of 1, is printed as 0: a choice.
-_ROUNDINGS = 16.0
 
 
 def multipliers_of(monodromy: Float[Array, "*batch n n"]) -> Complex[Array, "*batch n"]:
@@ -462,7 +458,7 @@ def multipliers_in_words(multipliers: Any, digits: int, rounding: float) -> list
     """Format multipliers: as real numbers if the imaginary part is below `rounding`, relative to
     the modulus, and as 0 below the rounding of their matrix."""
     values = np.asarray(multipliers)
-    zero = _ROUNDINGS * np.finfo(values.dtype).eps * max(1.0, np.abs(values).max(initial=0.0))
+    zero = ROUNDINGS * np.finfo(values.dtype).eps * max(1.0, np.abs(values).max(initial=0.0))
 
     def word(z: complex) -> str:
         if abs(z) < zero:

@@ -31,12 +31,10 @@ from ..machine import (
     modes_of,
     nearest_images,
     raveled,
-    with_leaf,
     with_modes,
     without_modes,
 )
 from .birkhoff import QUASIPERIODIC, agreement, rotation_number, weights, without_angles
-from .corrector import on_host
 from .cycle_map import CycleMap, cycle_map, map_state
 from .equations import Observed, Shooting
 from .from_orbit import (
@@ -44,7 +42,6 @@ from .from_orbit import (
     equations_along,
     fixed_step_method,
     placed_events,
-    steps_of,
     with_sections,
     with_sizes,
 )
@@ -146,7 +143,7 @@ class Torus:
             self.equations.on_section(self.curve, angles + turn) for turn in (0.0, self.rotation)
         )
         the_map = cycle_map(self.machine, self.cycles, method=self.method)
-        end = in_lanes(_mapped, (the_map, self.problem), begin)
+        end = _mapped((the_map, self.problem), begin)
         end = nearest_images(angles_in(self.machine, self.problem.like), end, wanted)
         difference = (end - wanted) / np.asarray(self.problem.sizes)[1:]
         return float(np.abs(difference).max()) if np.isfinite(difference).all() else np.inf
@@ -307,10 +304,10 @@ def first_mode(equations: Equations, curve: Curve) -> tuple[np.ndarray, float]:
     return mode, float(np.abs(mode).max())
 
 
-@on_host
-def _mapped(map_and_equations: tuple[CycleMap, Shooting], rows):
+@in_lanes
+def _mapped(map_and_equations: tuple[CycleMap, Shooting], row):
     the_map, problem = map_and_equations
-    return jax.vmap(lambda row: raveled(the_map(begin_on_section(problem, row)))[0])(rows)
+    return raveled(the_map(begin_on_section(problem, row)))[0]
 
 
 def _start_equations(
@@ -500,7 +497,9 @@ def torus_near(orbit: Orbit, parameter: str, width: float, distance: float) -> T
     like, machine = orbit.state, orbit.machine
     rows, method = np.asarray(raveled(without_modes(like))[0])[None], torus_method(None, machine)
     motion, x = _start_equations(machine, method, like, int(orbit.cycles), rows, 0.0)
-    equations = Equations(with_parameter(motion.problem, parameter, width))
+    equations = Equations(
+        dataclasses.replace(motion.problem, parameters=(parameter,), widths=jnp.asarray([width]))
+    )
     point = Curve(x, 0.0, np.array([float(leaf(machine, parameter))]))
     rotation, mode = equations.rotating_mode(point)
     waves = np.exp(2j * np.pi * angles_of(_FIRST))[:, None]
@@ -517,15 +516,3 @@ def torus_near(orbit: Orbit, parameter: str, width: float, distance: float) -> T
             "shorter distance."
         )
     return torus_of(solved, equations)
-
-
-def with_parameter(
-    problem: Shooting, name: str, width: float, ends: tuple[float, ...] = ()
-) -> Shooting:
-    """Return the equations with a parameter of this size among the unknowns, with steps enough for
-    these values of it."""
-    corners = [problem.machine, *(with_leaf(problem.machine, name, end) for end in ends)]
-    steps = steps_of(problem.method, corners, problem.like, problem.cycles)
-    return dataclasses.replace(
-        problem, parameters=(name,), steps=max(problem.steps, steps), widths=jnp.asarray([width])
-    )

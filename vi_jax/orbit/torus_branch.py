@@ -13,7 +13,7 @@ from .._checks import count, flag, interval
 from .._messages import ReportProgress, at_work
 from ..machine import check_leaf, in_unit, leaf, units_of
 from .find import find_orbit
-from .from_orbit import check_parameter
+from .from_orbit import check_parameter, with_parameters
 from .kinds import GRAZING, TORUS
 from .results import Orbit
 from .tolerances import LOCATED, ROUGHLY, SAME
@@ -24,7 +24,6 @@ from .torus import (
     first_mode,
     margins_of,
     torus_of,
-    with_parameter,
 )
 from .torus_equations import Curve, Equations, Solved, angles_of, derivative, interpolated
 from .walk import BOUNDS, INTERRUPTED, SAME_CURVE, STALLED, check_walk
@@ -183,12 +182,13 @@ def continue_torus(
     bounds = interval("bounds", bounds)
     value = float(leaf(torus.machine, parameter))
     check_parameter(torus.machine, parameter, value, bounds, "torus")
-    width = 0.5 * (bounds[1] - bounds[0])
-    equations = Equations(with_parameter(torus.problem, parameter, width, bounds))
+    problem = with_parameters(torus.problem, torus.curve.x[0], (parameter,), [bounds])
+    equations = Equations(problem)
     start = equations.solve_near(torus.curve._replace(p=np.array([value])))
     if start is None:
         raise ValueError("Argument `torus` could not be refined in this parameter.")
-    walks = [_Walk(equations, bounds, start, sense, most) for sense in (1.0, -1.0)]
+    back = start._replace(tangent=start.tangent.plus(-2.0, start.tangent))
+    walks = [_Walk(equations, bounds, begin, most) for begin in (start, back)]
 
     def result() -> TorusBranch:
         ahead, back = walks
@@ -207,14 +207,9 @@ def continue_torus(
 
 
 class _Walk:
-    def __init__(
-        self, equations: Equations, bounds: tuple[float, float], start: Solved, sense: float,
-        most: int,
-    ):  # fmt: skip
+    def __init__(self, equations: Equations, bounds: tuple[float, float], start: Solved, most: int):
         self.equations, self.bounds, self.most = equations, bounds, most
-        ahead = start.tangent.plus(sense - 1.0, start.tangent)
-        self.points, self.windows = [equations.directed(start, ahead)], []
-        self.end = _End(INTERRUPTED)
+        self.points, self.windows, self.end = [start], [], _End(INTERRUPTED)
 
     def walk(
         self, report: ReportProgress, *, step: float, max_step: float, max_points: int
@@ -222,17 +217,15 @@ class _Walk:
         length, end = step, None
         while end is None and len(self.points) < max_points:
             new = self._advance(length)
-            if isinstance(new, str):
+            if new == TORUS:
+                end = _End(TORUS, "the curve shrinks to a periodic motion")
+            elif isinstance(new, str):
                 length *= 0.4
-                shrinks, short = new == TORUS, length < _SHORTEST * max_step
-                end = _End(TORUS, "the curve shrinks to a periodic motion") if shrinks else None
-                end = self._stalled(max_step, new) if short and end is None else end
-                continue
-            end, last = self._ending(new)
-            if last is not None:
-                self._append(last)
-            report(1)
-            length = min(1.4 * length if new.iterations <= 5 else length, max_step)
+                end = self._stalled(max_step, new) if length < _SHORTEST * max_step else None
+            else:
+                end = self._append(new)
+                report(1)
+                length = min(1.4 * length if new.iterations <= 5 else length, max_step)
         self.end = end or _End("max_points")
 
     def _advance(self, length: float) -> Solved | str:
@@ -246,40 +239,37 @@ class _Walk:
         (before, _), (after, size) = (first_mode(equations, c) for c in (here, new.curve))
         if np.vdot(before, after).real <= 0 or size < SAME:
             return TORUS
-        if equations.unit(new.tangent) @ equations.pack(ahead) < SAME_CURVE:
+        if equations.pack(new.tangent) @ equations.pack(ahead) < SAME_CURVE:
             return STALLED
         finer = equations.refined(new, self.most)
         if finer is None or equations.tail(finer.curve) > ROUGHLY:
             return COARSE
         return finer
 
-    def _append(self, new: Solved) -> None:
-        here = self.points[-1].curve
+    def _append(self, new: Solved) -> _End | None:
+        """Append a torus, or the end of the family before it, which is returned."""
+        equations, here, end = self.equations, self.points[-1].curve, None
+        before, value = float(here.p[-1]), float(new.curve.p[-1])
+        for bound in self.bounds:
+            if (value - bound) * (before - bound) < 0:
+                share, end = (bound - before) / (value - before), _End(BOUNDS)
+                at = equations.solve_near(here.towards(new.curve, share), bound)
+                if at is None:
+                    return _End(STALLED)
+                new = at
+        margins = margins_of(equations, new.curve)
+        number = int(np.argmin([margin.share for margin in margins]))
+        if margins[number].crossed:
+            at = self._locate(new, number)
+            if at is None:
+                return _End(STALLED, "an event changes, at a place that was not located")
+            met, new = margins_of(equations, at.curve)[number], at
+            end = _End(ORDER if met.change in REORDERED else GRAZING, str(met))
         for p, q in _ratios(here.rotation, new.curve.rotation):
             share = (p / q - here.rotation) / (new.curve.rotation - here.rotation)
             self.windows.append(self._window(here.towards(new.curve, share), p, q))
-        self.points.append(self.equations.directed(new, self.points[-1].tangent))
-
-    def _ending(self, new: Solved) -> tuple[_End | None, Solved | None]:
-        """Return how the family ends before a torus, if it does, and its last torus."""
-        equations, here, end = self.equations, self.points[-1].curve, None
-        before, value = float(here.p[-1]), float(new.curve.p[-1])
-        bound = next((b for b in self.bounds if (value - b) * (before - b) < 0), None)
-        if bound is not None:
-            share = (bound - before) / (value - before)
-            at = equations.solve_near(here.towards(new.curve, share), bound)
-            if at is None:
-                return _End(STALLED), None
-            end, new = _End(BOUNDS), at
-        margins = margins_of(equations, new.curve)
-        number = int(np.argmin([margin.share for margin in margins]))
-        if not margins[number].crossed:
-            return end, new
-        at = self._locate(new, number)
-        if at is None:
-            return _End(STALLED, "an event changes, at a place that was not located"), None
-        met = margins_of(equations, at.curve)[number]
-        return _End(ORDER if met.change in REORDERED else GRAZING, str(met)), at
+        self.points.append(new)
+        return end
 
     def _locate(self, new: Solved, number: int) -> Solved | None:
         """Return the torus at which a margin is zero, between the last one and another."""

@@ -13,7 +13,7 @@ permutation in place of S the rows are the periods of a motion that repeats afte
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -37,56 +37,51 @@ _MOST, _LONGEST = 14, 0.3
 _TAIL = 0.8
 
 
-def in_lanes(program: Callable[..., Any], shared: Any, *rows: np.ndarray) -> Any:
-    """Return the results of a compiled program for rows of arguments, some at a time."""
-    count, parts = len(rows[0]), []
-    for begin in range(0, count, _LANES):
-        index = np.minimum(np.arange(begin, begin + _LANES), count - 1)
-        parts.append(program(shared, *(np.asarray(a, float)[index] for a in rows)))
-    return jax.tree.map(lambda *a: np.concatenate(a)[:count], *parts)
+def in_lanes(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function of something shared and of rows, each an array of the host, for all rows
+    of some arrays; so many at a time."""
+    program = on_host(lambda shared, *rows: jax.vmap(partial(function, shared))(*rows))
+
+    def call(shared: Any, *rows: np.ndarray) -> Any:
+        count, parts = len(rows[0]), []
+        for begin in range(0, count, _LANES):
+            index = np.minimum(np.arange(begin, begin + _LANES), count - 1)
+            parts.append(program(shared, *(np.asarray(a, float)[index] for a in rows)))
+        return jax.tree.map(lambda *a: np.concatenate(a)[:count], *parts)
+
+    return call
 
 
-@on_host
+@in_lanes
 def _linearize(problem_and_sizes: tuple[Shooting, np.ndarray], x, following, p):
-    """Return derivatives and residuals of motions, both divided by the largest derivative in each
-    row, with respect to the unknowns of a motion and of the following one, and the parameters."""
-    (problem, sizes), size = problem_and_sizes, x.shape[1]
+    """Return derivatives and residual of a motion, both divided by the largest derivative in each
+    row, with respect to the unknowns of the motion and of the following one, and the parameters."""
+    problem, sizes = problem_and_sizes
 
     def residual(z):
-        own, following, p = jnp.split(z * sizes, [size, 2 * size])
+        own, following, p = jnp.split(z * sizes, [x.size, 2 * x.size])
         return problem.motion_residual(jnp.concatenate([own, p]), following=following)
 
-    along = lambda *z: scaled_jacobian(residual, jnp.concatenate(z) / sizes)[:2]
-    return jax.vmap(along)(x, following, p)
+    return scaled_jacobian(residual, jnp.concatenate([x, following, p]) / sizes)[:2]
 
 
-@on_host
-def _observe(problem: Shooting, x, following):
-    return jax.vmap(problem.observe)(x, following)
+_observe = in_lanes(lambda problem, x, following: problem.observe(x, following))
 
 
-@on_host
-def _rates(problem: Shooting, x):
+@in_lanes
+def _rate(problem: Shooting, x):
     """Return the rate of the state just before the first event."""
-
-    def rate(x):
-        clock, states = problem.parts(x)
-        return problem.flight(problem.at(x), problem.legs - 1).rate(clock[0], states[0])
-
-    return jax.vmap(rate)(x)
+    clock, states = problem.parts(x)
+    return problem.flight(problem.at(x), problem.legs - 1).rate(clock[0], states[0])
 
 
-@on_host
+@in_lanes
 def _on_section(problem: Shooting, x):
     """Return the state on the section with which a motion begins, else that in which it ends."""
-
-    def state(x):
-        leg, clock = problem.legs - 1, problem.period(x)
-        if begins_on_section(problem):
-            leg, clock = 0, problem.parts(x)[0][0]
-        return ravel_pytree(problem.state_at(x, leg, clock))[0]
-
-    return jax.vmap(state)(x)
+    leg, clock = problem.legs - 1, problem.period(x)
+    if begins_on_section(problem):
+        leg, clock = 0, problem.parts(x)[0][0]
+    return ravel_pytree(problem.state_at(x, leg, clock))[0]
 
 
 def begins_on_section(problem: Shooting) -> bool:
@@ -152,7 +147,7 @@ class Solved(NamedTuple):
     curve: Curve
     iterations: int
     tangent: Curve
-    """The change of the unknowns for a change of the last condition's value."""
+    """The direction, of unit length, in which the last condition's value grows."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,7 +193,7 @@ class Equations:
         """Return `Observed` of the motion from each node, or from other angles, in arrays."""
         angles = angles_of(len(curve.x)) if angles is None else angles
         x, after = (interpolated(curve.x, angles + turn) for turn in (0.0, curve.rotation))
-        return in_lanes(_observe, self.motion(curve.p), x, after)
+        return _observe(self.motion(curve.p), x, after)
 
     def cocycle(self, curve: Curve) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivative over a period and the direction along the curve, at each node. Both
@@ -210,19 +205,19 @@ class Equations:
             ends = np.einsum("jab,jb->ja", matrices, along)
             along = interpolated(ends, angles_of(len(ends)) - curve.rotation)
         elif problem.events:
-            along = along - slopes[:, :1] * in_lanes(_rates, self.motion(curve.p), curve.x)
+            along = along - slopes[:, :1] * _rate(self.motion(curve.p), curve.x)
         sizes = np.asarray(problem.sizes)[1:]
         return matrices * sizes / sizes[:, None], along / sizes
 
     def on_section(self, curve: Curve, angles: np.ndarray) -> np.ndarray:
         """Return the states on the section at some angles, (angles, states)."""
         back = 0.0 if begins_on_section(self.problem) else curve.rotation
-        return in_lanes(_on_section, self.motion(curve.p), interpolated(curve.x, angles - back))
+        return _on_section(self.motion(curve.p), interpolated(curve.x, angles - back))
 
     def growth(self, cycle: Curve) -> float:
         """Return the greatest modulus of a multiplier of a periodic motion, a row for a period."""
         after = np.roll(cycle.x, -1, axis=0)
-        found = in_lanes(_observe, self.motion(cycle.p), cycle.x, after).monodromy
+        found = _observe(self.motion(cycle.p), cycle.x, after).monodromy
         product = np.linalg.multi_dot([np.eye(found.shape[-1]), *found[::-1]])
         return float(np.abs(np.linalg.eigvals(product)).max())
 
@@ -238,6 +233,7 @@ class Equations:
             moves = self._newton(curve, conditions, is_cycle)
             if moves is None:
                 return None
+            moves[1] /= np.linalg.norm(moves[1])
             move, tangent = (self.unpack(row, len(curve.x)) for row in moves)
             size = max(np.abs(move.x / self.scale).max(), *np.abs(moves[0][move.x.size :]))
             share = min(1.0, _LONGEST / size) if size > 0 else 1.0
@@ -283,7 +279,7 @@ class Equations:
         (count, width), units = curve.x.shape, self.scale * np.sqrt(len(curve.x))
         shared = self.problem, np.concatenate([units, units, self.widths])
         p = np.tile(curve.p, (count, 1))
-        columns, residual = in_lanes(_linearize, shared, curve.x, following, p)
+        columns, residual = _linearize(shared, curve.x, following, p)
         return *np.split(columns, [width, 2 * width], axis=2), residual
 
     def _value_of(self, curve: Curve, index: int, value: float) -> Condition:
@@ -294,9 +290,9 @@ class Equations:
 
     def along(self, rows: np.ndarray, x: np.ndarray) -> Condition:
         """Return the condition that a curve does not move along `rows` against `x`."""
-        none = np.zeros(len(self.widths))
-        direction = self.unit(Curve(rows, 0.0, none))
-        return direction, float(direction @ self.pack(Curve(x, 0.0, none)))
+        row, values = (self.pack(Curve(a, 0.0, np.zeros(len(self.widths)))) for a in (rows, x))
+        direction = row / np.linalg.norm(row)
+        return direction, float(direction @ values)
 
     def phase(self, curve: Curve) -> Condition:
         """Return the condition that a curve does not turn in itself against this one."""
@@ -304,18 +300,8 @@ class Equations:
 
     def across(self, curve: Curve, tangent: Curve, length: float = 0.0) -> Condition:
         """Return the condition that a curve lies in the plane across a tangent, at a distance."""
-        direction = self.unit(tangent.with_nodes(len(curve.x)))
+        direction = self.pack(tangent.with_nodes(len(curve.x)))
         return direction, float(direction @ self.pack(curve)) + length
-
-    def unit(self, tangent: Curve) -> np.ndarray:
-        row = self.pack(tangent)
-        return row / np.linalg.norm(row)
-
-    def directed(self, solved: Solved, before: Curve) -> Solved:
-        """Return a solution with its tangent of unit length, in the direction of another one."""
-        row, nodes = self.unit(solved.tangent), len(solved.curve.x)
-        sense = np.sign(row @ self.pack(before.with_nodes(nodes)))
-        return solved._replace(tangent=self.unpack(sense * row, nodes))
 
     def solve_near(self, guess: Curve, value: float | None = None) -> Solved | None:
         """Solve at the guess's parameters, or at another value of the last one."""

@@ -23,10 +23,10 @@ from ..machine import nearest_images
 from .corrector import Step, advance, distance_along, on_host, step_error, steps_depend_on_motion
 from .edit_events import half_difference, repeats_from
 from .equations import Shooting
-from .from_orbit import COARSE, with_finer_steps, with_grown_sizes
+from .from_orbit import with_finer_steps, with_grown_sizes
 from .locate import locate_zero
 from .special import Point
-from .tolerances import EXACT, FAINT, LOCATED, NEARBY, ROUGHLY, SAME
+from .tolerances import CORRECTED, EXACT, FAINT, LOCATED, NEARBY, ROUGHLY, SAME
 
 # Reasons to end of every curve: Ctrl-C was pressed, the corrector fails, the curve closes, a bound.
 INTERRUPTED, STALLED, CLOSED, BOUNDS = "interrupted", "stalled", "closed", "bounds"
@@ -288,7 +288,7 @@ class _Walk:
         if not steps_depend_on_motion(table.problem):
             return False
         error = step_error(table.problem, new.x)
-        if error > max(COARSE, 10 * self._noise):  # otherwise rounding
+        if error > 10 * max(CORRECTED, self._noise):  # otherwise rounding
             refined = with_finer_steps(table.problem, new.x, error)
             if refined is not None:
                 table.problem = refined

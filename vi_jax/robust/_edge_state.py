@@ -10,11 +10,10 @@ from .._messages import ReportProgress, at_work, silent
 from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, in_rows, without_modes
-from ..orbit import Orbit, map_state
+from ..orbit import ALIKE, Orbit, map_state
 from ._settling import (
     ELSEWHERE,
     INADMISSIBLE,
-    NEAR,
     RECORDED,
     RETURNS,
     SAME,
@@ -36,7 +35,7 @@ _PIECES = 16
 # distance of a walk from its origin (1 for chaos, 0 for regular motions). Choices.
 _FEWEST, _CORRELATION = 200, 0.7
 
-# For a search the edge's motion must recur to within `NEAR`, a tenth of that after a failed search;
+# For a search the edge's motion must recur to within `ALIKE`, after a failed search a tenth of it;
 # the orbit found may be farther off by this factor. A choice.
 _FARTHER = 10.0
 
@@ -141,7 +140,7 @@ def track_edge(
 ) -> EdgeState:
     """Find the edge state between a start that returns and one that does not. Extend
     `section_states`."""
-    tolerance, section_states = NEAR, [] if section_states is None else section_states
+    tolerance, section_states = ALIKE, [] if section_states is None else section_states
     for _ in range(rounds):
         inside, outside = settling.bisected(inside, outside, _CLOSE)
         pair, sections = _follow_pair(settling, np.stack([inside, outside]))

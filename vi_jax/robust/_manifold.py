@@ -11,8 +11,8 @@ from .._checks import flag, given_number, one_of
 from .._messages import at_work
 from .._types import State
 from ..machine import AbstractMachine, Summarized, in_rows, is_autonomous, without_modes
-from ..orbit import Orbit, cycle_map
-from ._settling import NEAR, SAME, Row, Rows, Settling, in_row, one_orbit
+from ..orbit import ALIKE, Orbit, cycle_map
+from ._settling import SAME, Row, Rows, Settling, in_row, one_orbit
 
 # The largest angle, in radians, of a curve's turn from point to point; the share of `spacing` to
 # which points are set closer for a smaller turn. Choices.
@@ -219,7 +219,7 @@ def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pi
         arc_length = reached + np.concatenate([[0.0], np.cumsum(steps)])
         used = int(np.searchsorted(arc_length, length)) + 1
         cut = np.flatnonzero(~connected[: used - 1])
-        if arc_length[-1] - reached < NEAR * spacing and reached > spacing:
+        if arc_length[-1] - reached < ALIKE * spacing and reached > spacing:
             break  # it has reached an attractor
         reached = float(min(arc_length[-1], length))
         yield np.insert(rows[:used], cut + 1, np.nan, axis=0), reached

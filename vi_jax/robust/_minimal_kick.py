@@ -28,9 +28,9 @@ from .._messages import at_work
 from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, components, in_rows, state_in_words, units_of
-from ..orbit import Orbit, cycle_map
+from ..orbit import CORRECTED, FAINT, LOCATED, Orbit, cycle_map
 from ._edge_state import EdgeState, track_edge
-from ._settling import ELSEWHERE, RETURNS, UNCHANGED, Row, Rows, Settling, images, settling_on
+from ._settling import ELSEWHERE, RETURNS, Row, Rows, Settling, images, settling_on
 
 Kicks = Float[np.ndarray, "..."]
 """Kicks, the components in the last axis."""
@@ -222,7 +222,7 @@ def _around(unit: Row, angle: float, rng: np.random.Generator) -> Kicks:
 
 
 # Newton's method begins where the motion on the edge is this near to the saddle; it adds periods
-# until a kick is `UNCHANGED`, relative to its norm. A choice.
+# until a kick is `CORRECTED`, relative to its norm. A choice.
 _NEAR_SADDLE = 0.05
 
 # A change below this, relative to the norm, is the method's error if it exceeds half the one
@@ -276,7 +276,7 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
 
 def _is_converged(change: float, last: float) -> bool:
     """Return whether a change, relative to the norm, is zero or within the method's error."""
-    return change <= UNCHANGED or last / 2 <= change <= _NOISE
+    return change <= CORRECTED or last / 2 <= change <= _NOISE
 
 
 def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
@@ -329,12 +329,6 @@ def _newton(edge: Callable[[Kicks], tuple[Row, Kicks]], z: Row) -> tuple[Row, fl
         last = length / norm
     return None
 
-
-# Simulations with the kick larger and smaller by this share confirm it.
-_MARGIN = 1e-6
-
-# Two kicks are the same within this, relative to their norm. A choice.
-_SAME = 1e-4
 
 # Rounds of refinement around the best rays: before Newton's method, and instead of it. Choices: the
 # latter narrow a turn of 1/128 to 1e-8.
@@ -482,7 +476,7 @@ def minimal_kick(
         for unit, radius in nearest_first(rays, candidates):
             exact = _exact(settling, kick, unit, radius, angle, longest, seed)
             new = _described(settling, kick, exact, longest, cycle, phase)
-            if all(_distance(new, old) > _SAME for old in kicks):
+            if all(_distance(new, old) > FAINT for old in kicks):
                 kicks.append(new)
     return _smallest(kicks, settling)
 
@@ -504,14 +498,14 @@ def _exact(
     line = Exits(unit[None], np.array([inside]), np.array([outside]))
     line = narrowed(settling, kick, line, _ALL_BITS)
     outside = float(line.outside[0])
-    ends = kick.rows(np.array([line.inside[0], outside * (1 + _MARGIN)])[:, None] * unit)
+    ends = kick.rows(np.array([line.inside[0], outside * (1 + LOCATED)])[:, None] * unit)
     if settling.begin > 0:
         ends = settling.states_after(ends, 1)
     edge = track_edge(settling.starting_at(0.0), ends[0], ends[1], longest, _ROUNDS)
     if edge.kind == "saddle" and edge.orbit is not None:
         better = shortest(settling, kick, edge.orbit, unit * outside)
         longer = np.nan if better is None else np.linalg.norm(better[0]) / outside - 1
-        if better is not None and -_SHORTER <= longer <= _SAME:
+        if better is not None and -_SHORTER <= longer <= FAINT:
             return *better, True, edge
     narrow = angle / NARROWER**_FEW_ROUNDS
     unit, inside, outside = refine_direction(
@@ -559,7 +553,7 @@ def _described(
     settling: Settling, kick: Kick, found: _Found, longest: int, cycle: int, phase: float
 ) -> MinimalKick:
     z, residual, is_exact, edge = found
-    rows = kick.rows(np.array([1 - _MARGIN, 1 + _MARGIN])[:, None] * z)
+    rows = kick.rows(np.array([1 - LOCATED, 1 + LOCATED])[:, None] * z)
     verdicts = settling.judge(rows)
     row = kick.rows(z)
     changed = components(settling.state(row - kick.start))

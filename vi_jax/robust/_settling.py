@@ -28,6 +28,8 @@ from ..machine import (
     without_modes,
 )
 from ..orbit import (
+    ALIKE,
+    CORRECTED,
     CycleMap,
     MotionSections,
     Orbit,
@@ -50,11 +52,9 @@ RETURNS, ELSEWHERE, INADMISSIBLE = 1, 0, -1
 # Lanes of the program that judges starts: those beyond the last start are not run. A choice.
 _LANES = 1024
 
-# Relative to the motion's size (see `orbit.distance`). A motion whose sections change by less than
-# the first has settled, or is nearer to an unstable one than starts can be distinguished. Section
-# states a period apart are the same within the second. An orbit found from a state is its motion if
-# it lies within the third. Choices.
-UNCHANGED, SAME, NEAR = 1e-11, 1e-5, 1e-3
+# Section states a period apart are the same within this, relative to the motion's size (see
+# `orbit.distance`): a choice.
+SAME = 1e-5
 
 # Sections of a motion that are recorded in one run. A choice: longer motions take several runs.
 RECORDED = 16
@@ -113,8 +113,9 @@ class Settling:
             later, good, bad_start = self._advanced(rows, step, is_running, begin)
             if not done:
                 verdict[is_running & bad_start] = INADMISSIBLE
-            # A repeating state has settled: more cycles cost time, and end an equilibrium in noise.
-            moves = (self.motion.between(later, rows) > UNCHANGED) | (begin > 0)
+            # A repeating state has settled, or is nearer to an unstable motion than starts can be
+            # distinguished: more cycles cost time, and end an equilibrium in noise.
+            moves = (self.motion.between(later, rows) > CORRECTED) | (begin > 0)
             rows = np.where((is_running & good)[:, None], later, rows)
             is_running &= good
             returned = is_running.copy()
@@ -188,7 +189,7 @@ class Settling:
     def settled_orbit(self, start: Row, longest: int) -> Orbit | None:
         """Return the motion that a start settles on, made exact, or `None`."""
         rows = self.settled_rows(start, longest)
-        return None if rows is None else self.orbit_near(rows[0], len(rows), NEAR)
+        return None if rows is None else self.orbit_near(rows[0], len(rows), ALIKE)
 
     def orbit_near(self, row: Row, cycles: int, near: float) -> Orbit | None:
         """Return the periodic motion that a search from a state finds, if within `near` of it."""

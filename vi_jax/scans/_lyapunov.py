@@ -57,7 +57,16 @@ from ..machine import (
     with_units,
     without_modes,
 )
-from ..orbit import CycleMap, as_chain, cycle_map, digits_of, map_state, without_angles
+from ..orbit import (
+    ROUNDINGS,
+    CycleMap,
+    as_chain,
+    cycle_map,
+    digits_of,
+    map_state,
+    weights,
+    without_angles,
+)
 
 
 class Lyapunov(Summarized):
@@ -130,10 +139,6 @@ _AT_ONCE = 512
 
 # Places of a mean over the weights, whose sum over many cycles it gives to rounding: a choice.
 _NODES = 512
-
-# A direction that is this number of roundings of its previous length counts as zero: a choice, some
-# times the error of the projections.
-_ROUNDING = 16
 
 
 @warning_once
@@ -446,7 +451,7 @@ def _orthonormalize(
                 column = column - jnp.dot(other, column) * other
         size = _length(column)
         # A direction that vanishes, as in a rest, contains only rounding.
-        vanished = size <= _ROUNDING * jnp.finfo(size.dtype).eps * before
+        vanished = size <= ROUNDINGS * jnp.finfo(size.dtype).eps * before
         columns.append(jnp.where(vanished, 0.0, column / jnp.where(vanished, 1.0, size)))
         sizes.append(jnp.where(vanished, 0.0, size))
     return jnp.stack(columns, axis=1), jnp.stack(sizes)
@@ -456,8 +461,7 @@ def _weighted(rates, duration):
     """Return mean rates in time, and those of the greatest exponent in both halves."""
 
     def mean(rates, duration):
-        position = (jnp.arange(duration.size, dtype=duration.dtype) + 0.5) / duration.size
-        weight = jnp.exp(-1 / (position * (1 - position)))
+        weight = jnp.asarray(weights(duration.size), duration.dtype)
         # At both ends weights underflow, and 0 · ∞ is NaN.
         lost = jnp.any(rates == -jnp.inf, axis=0)
         return jnp.where(lost, -jnp.inf, weight @ jnp.where(lost, 0.0, rates)) / (weight @ duration)

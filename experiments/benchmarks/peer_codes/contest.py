@@ -34,10 +34,6 @@ class Job:
         """Indices of its lanes."""
         return np.concatenate(self.shares)
 
-    def all(self, *message: Any) -> tuple[list, float]:
-        """Send the same message to all of its workers; return their answers and the seconds."""
-        return together(self.workers, [message] * len(self.workers))
-
     def begin_build(self, task: Task) -> None:
         """Send the entry to the workers to be compiled, without waiting."""
         for worker, share in zip(self.workers, self.shares, strict=True):
@@ -51,11 +47,11 @@ class Job:
 
     def result(self) -> np.ndarray:
         """Return the results of its lanes, in the order of `lanes`."""
-        return np.concatenate(self.all("result", self.entry.name)[0])
+        return np.concatenate(together(self.workers, "result", self.entry.name)[0])
 
     def timed(self) -> float:
         """Return the seconds for all lanes, scaled up if the entry runs a sample."""
-        return self.all("run", self.entry.name)[1] * LANES / len(self.lanes)
+        return together(self.workers, "run", self.entry.name)[1] * LANES / len(self.lanes)
 
 
 class Bench:
@@ -152,7 +148,7 @@ def measure(bench: Bench, task: Task, listed: list[Entry], truth, *, all_cores: 
         row["seconds"] = statistics.median(row["times"])
         note(f"  {row['name']:48s} {row['seconds']:9.3f} s  error {row['error']:.1e}")
     for worker in {id(worker): worker for job in jobs for worker in job.workers}.values():
-        together([worker], [("drop", "")])
+        together([worker], "drop", "")
     return rows
 
 
