@@ -27,15 +27,6 @@ def _regimes_of(lanes, settle):
 
 
 @pytest.mark.slow
-def test_periodic_chaotic_and_unsettled_motions():
-    zetas = [0.65, 0.7, 0.9, 0.97, 1.1, 1.4]
-    data = _regimes_of([(zeta, 0.8, 0.0) for zeta in zetas], settle=3000)
-    period = dict(zip(zetas, np.asarray(data.period).tolist(), strict=True))
-    assert period[0.9] == 2 and period[1.1] == 1
-    assert period[0.7] == period[0.97] == vi.REGIMES.chaotic
-
-
-@pytest.mark.slow
 def test_an_undamped_motion_has_two_frequencies():
     """Its section turns by 1/ratio in each cycle: at 0.77 it repeats after 77 cycles."""
     free, ratios = vi.Scene.ideal(frequency_ratio=0.77, gap=None), [0.77, 1 / np.sqrt(3)]
