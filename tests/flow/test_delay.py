@@ -102,17 +102,6 @@ def test_linear_equation_is_exact():
     np.testing.assert_allclose(run.sections.x[4], -4.606955991e-4, rtol=0, atol=1e-12)
 
 
-def test_impacts_with_feedback():
-    run = vi.simulate(Struck(), cycles=50, impact_log=3)
-    end = [run.sections.x[jnp.array([5, 50])], run.sections.u[jnp.array([5, 50])]]
-    wanted = [[-0.3721662410390, -0.3631911832734], [-0.7218104265337, -0.7155667014084]]
-    np.testing.assert_allclose(end, wanted, rtol=0, atol=1e-9)
-    assert int(run.impacts.sum()) == 51
-    times = np.asarray(run.impact_log.phase)
-    times = [times[0, 0], times[0, 1], times[1, 0] + 2 * np.pi / 0.8]
-    np.testing.assert_allclose(times, [1.2897849071, 6.6933253587, 14.8037714534], atol=1e-9)
-
-
 def test_derivative_with_respect_to_a_delay():
     class Lagged(Linear):
         lag: float = 1.0

@@ -129,7 +129,7 @@ def random_blocks(rng, lanes):
 @pytest.mark.slow
 def test_random_blocks_on_a_shaken_floor():
     """Blocks and rods with two corners."""
-    lanes = 60
+    lanes = 30
     given, q, v = random_blocks(np.random.default_rng(1), lanes)
     a, h, mu = given["half_width"], given["half_height"], np.repeat(given["mu"][:, None], 2, 1)
 
@@ -146,25 +146,6 @@ def test_random_blocks_on_a_shaken_floor():
     error, good = compared(ShakenBlock, given, gaps, places, mass, mu, q, v, pull)
     assert good.all()
     assert (error < np.where(given["restitution"] == 1, 1e-7, 1e-4)).all(), error
-
-
-@pytest.mark.slow
-def test_no_motion_on_a_floor_at_rest_gains_energy():
-    given, q, v = random_blocks(np.random.default_rng(2), 120)
-    numbers = jax.tree.map(jnp.asarray, ({**given, "sizes": 0 * given["sizes"]}, q, v))
-
-    def one(given, q, v):
-        machine = ShakenBlock(**given, cycle=END / 16)
-        start = machine.at(
-            **dict(zip(machine.q, q, strict=True)), v=dict(zip(machine.q, v, strict=True))
-        )
-        run = vi.simulate(machine, start, 16, max_impacts=4000)
-        return jax.vmap(machine.energy)(run.sections), run.successful
-
-    energy, good = map(np.asarray, jax.jit(jax.vmap(one))(*numbers))
-    # Rocks and hops that converge slowly may be given up.
-    assert good.sum() >= 118
-    assert (np.diff(energy[good], axis=1) < 1e-9).all()
 
 
 class Stack(vi.Mechanical):
@@ -196,7 +177,7 @@ class Stack(vi.Mechanical):
 
 @pytest.mark.slow
 def test_random_stacks_on_a_shaken_floor():
-    lanes, rng = 40, np.random.default_rng(5)
+    lanes, rng = 20, np.random.default_rng(5)
     sizes, phases = shaking(rng, lanes, 8.0, 12.0)
     mass_2, mu = rng.uniform(0.3, 3.0, lanes), rng.uniform(0, 1, (lanes, 2))
     e = rng.choice([0.0, 0.3, 0.7, 1.0], lanes)
