@@ -210,11 +210,7 @@ VALVE = vi.machines.ReliefValve(flow_rate=5.0)
         (walled(), {"noise": vi.WhiteNoise({"Y": 0.5})}, "must change velocities only"),
         (walled(), {"noise": vi.WhiteNoise({"V": jnp.array([0.5, 1.0])})}, "one amplitude"),
         (walled(), {"noise": vi.WhiteNoise({"V": lambda x: jnp.ones(2)})}, "one returns shape"),
-        (
-            walled(),
-            {"noise": vi.WhiteNoise({"V": lambda x: 1j})},
-            "must hold real numbers, but its",
-        ),
+        (walled(), {"noise": vi.WhiteNoise({"V": lambda x: 1j})}, "must hold real numbers, but"),
         (VALVE, {}, r"as `machine.observed_every\(interval\)`"),
         (Reset(), {}, "without resets"),
     ],

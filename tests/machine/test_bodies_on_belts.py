@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
+pytestmark = pytest.mark.slow
+
 
 class Belt(vi.Mechanical):
     """A body held on a belt by static friction, and one that slides on it."""
@@ -63,7 +65,6 @@ def each_end(kind, given, cycles, method="standard", **start):
     return map(np.asarray, jax.jit(jax.vmap(last))(jax.tree.map(jnp.asarray, given)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", ["standard", vi.FixedStep(steps_per_cycle=150)])
 def test_static_friction_lets_go_on_a_belt(method):
     draw, n = np.random.default_rng(0).uniform, 4000
@@ -153,7 +154,6 @@ def drawn(seed, n):
     return given
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["three", "stop", "bodies", "full mass matrix"])
 def test_static_ratios_and_impacts_on_belts(kind):
     """Regressions: frictions that began to slip at one instant and held each other again ended
@@ -176,7 +176,6 @@ def test_static_ratios_and_impacts_on_belts(kind):
     np.testing.assert_allclose(found, finer, rtol=0, atol=1e-8)
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:vi_jax is running in single precision")
 @pytest.mark.parametrize("kind", [Belt, Coupled])
 def test_single_precision(kind):
@@ -201,7 +200,6 @@ def test_single_precision(kind):
     np.testing.assert_allclose(found[good], expected[good], rtol=0, atol=1e-4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "lane", "expected"),
     [
@@ -242,7 +240,6 @@ def numbers_of(given, moved):
     return jnp.nan_to_num(found), (log.kind, log.number, run.successful)
 
 
-@pytest.mark.slow
 def test_derivatives_of_logs_averages_and_energies():
     """Each entry, along a direction of six parameters, forward beside Richardson differences, and a
     sum of all in reverse."""

@@ -235,14 +235,8 @@ class Feet(Block):
     cycle = 0.5
 
     @property
-    def contacts(self):
-        h, found = self.half_height, []
-        for place in self.feet:
-            height = lambda q, b=place: q.y + b * jnp.sin(q.tilt) - h * jnp.cos(q.tilt)
-            along = lambda q, b=place: q.x + b * jnp.cos(q.tilt) + h * jnp.sin(q.tilt)
-            rubs = dict(friction=self.mu, along=along)
-            found.append(vi.RigidStop(0.0, self.restitution, "left", on=height, **rubs))
-        return tuple(found)
+    def places(self):
+        return dict(zip("abc", self.feet, strict=False))
 
     def force(self, t, q, v):
         return dict(x=self.size * jnp.sin(4 * jnp.pi * t), y=-9.81, tilt=0.0)

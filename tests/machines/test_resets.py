@@ -160,9 +160,8 @@ def test_guards_without_a_slope(guard):
     # The event lies at x = p, so the k-th comes at the time k p.
     (phase, last, successful), (rates, slope, _) = jax.jvp(run, (0.7,), (1.0,))
     assert bool(successful)
-    np.testing.assert_allclose(
-        phase, 0.7 * np.arange(1, 8), rtol=0, atol=1e-12 + 1e-11 * (guard == "jump")
-    )
+    close = 1e-12 + 1e-11 * (guard == "jump")
+    np.testing.assert_allclose(phase, 0.7 * np.arange(1, 8), rtol=0, atol=close)
     np.testing.assert_allclose(last, 0.1, atol=1e-11)
     for found, expected in ((rates, np.arange(1, 8)), (slope, -7.0)):
         right = np.isclose(found, expected, rtol=1e-9)
