@@ -151,7 +151,7 @@ def test_the_motion_beyond_a_rest_is_as_accurate_as_the_branch():
     )  # fmt: skip
     settled = vi.simulate(machine, machine.at(x=-0.6), 3, settle=300, rests=True).last
     orbit = vi.find_orbit(machine, settled, cycles=3, throw=True)
-    branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=(0.947, 1.6), progress=False)
+    branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=(0.947, 2.209), progress=False)
     lost = min((x for x in branch.special if x.kind == "rest"), key=lambda x: x.parameter)
     beyond = lost.switch(distance=0.005)
     last = vi.simulate(beyond.machine, beyond.state, 3).last
