@@ -47,9 +47,8 @@ class Chain(vi.Mechanical):
 
 def row(z):
     """Return the positions and velocities of a chain as two arrays."""
-    return np.array([x for name, x in vars(z).items() if name != "v"]), np.array(
-        [*vars(z.v).values()]
-    )
+    places = [x for name, x in vars(z).items() if name != "v"]
+    return np.array(places), np.array([*vars(z.v).values()])
 
 
 def passed(v, k, masses, wall=False):

@@ -21,9 +21,7 @@ _UNCHECKED = {"__init__", "lanes"}
 
 
 def pytest_addoption(parser):
-    parser.addoption(
-        "--annotations", action="store_true", help="check the package's annotations at run time"
-    )
+    parser.addoption("--annotations", action="store_true", help="check the package's annotations")
 
 
 def pytest_configure(config):

@@ -1,6 +1,8 @@
 """Ten machines in which time and each component have units of their own, as parameters: a change of
 these, of the section or of the order of contacts and events does not change an answer."""
 
+import itertools
+import math
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
@@ -16,7 +18,7 @@ def ordered(is_flipped, *parts):
     return parts[::-1] if is_flipped else parts
 
 
-class _InUnits(vi.AbstractMachine):
+class _Numbers(eqx.Module):
     scales: Any
     p: Any
     phase: Any = 0.0
@@ -38,6 +40,8 @@ class _InUnits(vi.AbstractMachine):
     def cycle(self):
         return self.length * self.time
 
+
+class _InUnits(_Numbers, vi.AbstractMachine):
     def start(self):
         return vi.State(**{n: self.scales[i] * self.begins[i] for i, n in enumerate(self.names)})
 
@@ -179,25 +183,12 @@ class Sliding(_InUnits):
         return u, push, -0.3 * w
 
 
-class _Linked(vi.Mechanical):
+class _Linked(_Numbers, vi.Mechanical):
     """Two bodies, each coordinate in a unit of its own."""
 
-    scales: Any
-    p: Any
-    phase: Any = 0.0
-    time: Any = 1.0
-    is_flipped: bool = eqx.field(static=True, default=False)
-
-    length: ClassVar[float | None] = None
     q = ("a", "b")
-    linked: ClassVar[tuple[tuple[int, ...], ...]] = ()
     names: ClassVar[tuple[str, ...]] = q
     inertia: ClassVar[Any]
-    begins: ClassVar[tuple[float, ...]]
-
-    @property
-    def cycle(self):
-        return self.length * self.time
 
     def start(self):
         return self.at(**{n: self.scales[i] * self.begins[i] for i, n in enumerate(self.q)})
@@ -286,24 +277,30 @@ def machine_of(kind, scales=None, phase=0.0, *, is_flipped=False, p=None, time=1
 
 
 def units_of(kind):
-    """Return the scales of components: each alone in a unit 1e-6 and 1e6 times as large."""
+    """Return scales of the components and of time, 1e-6 or 1e6, so few that each is large while
+    each other one is small in one of them: no set of the large ones contains that of another."""
     number = len(kind.names)
     alone = [(i,) for i in range(number) if all(i not in x for x in kind.linked)]
-    alone = list(kind.linked) if kind is Cranked else [*kind.linked, *alone]
-    return [np.where(np.isin(np.arange(number), x), f, 1.0) for x in alone for f in FACTORS]
+    units = [*kind.linked, *(() if kind is Cranked else alone), "time"]
+    count = next(n for n in itertools.count() if math.comb(n, n // 2) >= len(units))
+    large = dict(zip(units, itertools.combinations(range(count), count // 2), strict=False))
+    for row in range(count):
+        size = {unit: FACTORS[row in rows] for unit, rows in large.items()}
+        of = {i: size[unit] for unit in units[:-1] for i in unit}
+        yield np.array([of.get(i, 1.0) for i in range(number)]), size["time"]
 
 
 def in_units(kind) -> Iterator[Any]:
-    """Yield a machine in its first units, then in other units of each component and of time."""
+    """Yield a machine in its first units, then in others of the components and of time."""
     yield machine_of(kind)
-    yield from (machine_of(kind, scales) for scales in units_of(kind))
-    yield from (machine_of(kind, time=factor) for factor in FACTORS)
+    yield from (machine_of(kind, scales, time=time) for scales, time in units_of(kind))
 
 
-def variants(kind) -> Iterator[Any]:
-    """Yield a machine in all units, and if it is driven with another section and in another order
-    of contacts and events."""
+def variants(kind, *, order=False) -> Iterator[Any]:
+    """Yield a machine in several units, and if it is driven with another section and, if asked for,
+    in another order of contacts and events, which needs other programs."""
     yield from in_units(kind)
     if kind.length is not None:
         yield machine_of(kind, phase=0.37)
-        yield machine_of(kind, is_flipped=True)
+        if order:
+            yield machine_of(kind, is_flipped=True)

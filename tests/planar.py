@@ -25,11 +25,15 @@ class Block(vi.Mechanical):
         return 1.0, 1.0, (self.half_width**2 + self.half_height**2) / 3
 
     @property
+    def places(self):
+        return dict(left=-self.half_width, right=self.half_width)
+
+    @property
     def contacts(self):
-        a, h, found = self.half_width, self.half_height, []
-        for side, name in ((-1.0, "left"), (1.0, "right")):
-            height = lambda q, b=side: q.y + b * a * jnp.sin(q.tilt) - h * jnp.cos(q.tilt)
-            place = lambda q, b=side: q.x + b * a * jnp.cos(q.tilt) + h * jnp.sin(q.tilt)
+        h, found = self.half_height, []
+        for name, b in self.places.items():
+            height = lambda q, b=b: q.y + b * jnp.sin(q.tilt) - h * jnp.cos(q.tilt)
+            place = lambda q, b=b: q.x + b * jnp.cos(q.tilt) + h * jnp.sin(q.tilt)
             rubs = dict(friction=self.mu, along=place, name=name)
             found.append(vi.RigidStop(0.0, self.restitution, "left", on=height, **rubs))
         return tuple(found)

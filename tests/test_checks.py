@@ -18,12 +18,9 @@ def test_invalid_calls_raise_with_a_reason():
     script = Path(__file__).with_name("refused_calls.py")
     root = Path(_checks.__file__).parents[1]
     process = subprocess.run(
-        [sys.executable, str(script)],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(root)},
-        cwd=script.parent,
-    )
+        [sys.executable, str(script)], capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(root)}, cwd=script.parent,
+    )  # fmt: skip
     assert process.returncode == 0, process.stderr
     found = json.loads(process.stdout)
     assert found["wrong"] == {} and found["calls"] > 100

@@ -123,7 +123,7 @@ def flown(zeta, xi, stops, Y, V, cycles, *, section=0.0, fineness=32):
         there = (sign * Y >= gap) & (V == 0) & (sign * np.cos(section) > gap)
         held[there] = 1 + i
     whole = 2 * np.pi / zeta
-    kept, lows, highs, impacts, rests = [np.stack([Y, V])], [], [], [], []
+    begin, rows = np.stack([Y, V]), []
     for _ in range(cycles):
         t = np.zeros(lanes)
         low, high = Y.copy(), Y.copy()
@@ -143,12 +143,14 @@ def flown(zeta, xi, stops, Y, V, cycles, *, section=0.0, fineness=32):
             _look(
                 on, zeta, xi, section, stops, look, whole, (t, Y, V, held, low, high, hits, comes)
             )
-        kept.append(np.stack([Y, V]))
-        lows.append(low)
-        highs.append(high)
-        impacts.append(hits)
-        rests.append(comes)
-    return Truth(*map(np.array, (kept, lows, highs, impacts, rests)))
+        rows.append((np.stack([Y, V]), low, high, hits, comes))
+    return _truth(begin, rows)
+
+
+def _truth(begin, rows):
+    """Return the results from the first state and the five numbers of each cycle."""
+    states, *others = zip(*rows, strict=True)
+    return Truth(*map(np.array, ((begin, *states), *others)))
 
 
 def _look(on, zeta, xi, section, stops, look, whole, arrays):
@@ -224,20 +226,21 @@ def integrated(drive, xi, stops, start, cycles, *, look=0.05, **options):
 
     **Returns:** a `Truth`.
     """
-    state = np.array([*start, *(() if isinstance(drive, dict) else (drive,)), 0.0])
+    ideal = not isinstance(drive, dict)
+    motor = {"w0": 1.0, **(dict.fromkeys(("tau0", "kappa", "eps", "mu"), 0.0) if ideal else drive)}
+    state = np.array([*start, *((drive,) if ideal else ()), 0.0])
     held = 0
     for i, (sign, gap, _) in enumerate(stops):
         if sign * start[0] >= gap and start[1] == 0 and sign > gap:
             held = 1 + i
-    kept, lows, highs, impacts, rests = [state[: len(start)]], [], [], [], []
+    begin, rows = state[: len(start)], []
     leaving = [sign * state[0] >= gap and sign * state[1] <= 0 for sign, gap, _ in stops]
     for _ in range(cycles):
         low = high = state[0]
         hits = comes = 0
         while True:
-            state, seen, met = _leg(
-                drive, xi, stops, state, held, leaving, max_step=look, **options
-            )
+            leg = _leg(motor, xi, stops, state, held, leaving, max_step=look, **options)
+            state, seen, met = leg
             low, high = min(low, *seen), max(high, *seen)
             if met == "section":
                 break
@@ -255,31 +258,22 @@ def integrated(drive, xi, stops, start, cycles, *, look=0.05, **options):
                 state[:2] = sign * gap, 0.0 if done else -sign * k * speed
                 if done:
                     comes, held = comes + 1, 1 + i
-                    state[2:] += wait * np.array(_rates(drive, xi, state)[2:])
+                    state[2:] += wait * np.array(_rates(motor, xi, state)[2:])
         state[3] = 0.0
-        kept.append(state[: len(start)].copy())
-        lows.append(low)
-        highs.append(high)
-        impacts.append(hits)
-        rests.append(comes)
-    return Truth(*map(np.array, (kept, lows, highs, impacts, rests)))
+        rows.append((state[: len(start)].copy(), low, high, hits, comes))
+    return _truth(begin, rows)
 
 
-def _rates(drive, xi, x):
+def _rates(motor, xi, x):
     """Return d/dτ of Y, V, W and the crank angle for the cosine crank."""
     Y, V, W, phi = x
-    turning = 0.0
-    if isinstance(drive, dict):
-        slope = -np.sin(phi)
-        torque = drive["tau0"] * (drive["kappa"] - W / drive.get("w0", 1.0)) + drive[
-            "eps"
-        ] * slope * (Y - np.cos(phi))
-        torque += drive["mu"] * slope * np.cos(phi) * W * W
-        turning = torque / (1 + drive["mu"] * slope**2)
-    return [V, np.cos(phi) - Y - 2 * xi * V, turning, W]
+    slope, pull = -np.sin(phi), np.cos(phi) - Y
+    torque = motor["tau0"] * (motor["kappa"] - W / motor["w0"]) - motor["eps"] * slope * pull
+    torque += motor["mu"] * slope * np.cos(phi) * W * W
+    return [V, pull - 2 * xi * V, torque / (1 + motor["mu"] * slope**2), W]
 
 
-def _leg(drive, xi, stops, state, held, leaving, **options):
+def _leg(motor, xi, stops, state, held, leaving, **options):
     """Integrate to the next event; return the state, Y at the extrema and the end, and the event.
 
     After an impact or a release, the body must turn towards the stop before a contact is searched,
@@ -287,7 +281,7 @@ def _leg(drive, xi, stops, state, held, leaving, **options):
     """
 
     def rates(t, x):
-        flow = _rates(drive, xi, x)
+        flow = _rates(motor, xi, x)
         return [0.0, 0.0, *flow[2:]] if held else flow
 
     def section(t, x):

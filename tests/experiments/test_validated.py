@@ -4,10 +4,8 @@ import re
 from math import floor, log10
 
 import pytest
-from validated.__main__ import ORDER, SCRIPTS, comparison_of, described, section
+from validated.__main__ import ORDER, PAGE, SCRIPTS, comparison_of, described, section
 from validated._comparison import Comparison, last_digit
-
-from gallery_page import rows, sections
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
@@ -56,3 +54,15 @@ def test_deviating_numbers_raise():
             Comparison("a code", "a page", "printed", [("x", "0.488", wrong)])
     with pytest.raises(ValueError, match="1e-02 apart"):
         Comparison("a code", "a page", "printed", [("x", "0.488", 0.5, 0.01)])
+
+
+def sections():
+    """Return the page's sections by the name of their script."""
+    _, *parts = re.split(r"^## ", PAGE.read_text(encoding="utf-8"), flags=re.M)
+    return {re.findall(r"validated/(\w+)\.py\), \d+ s\.", part)[0]: part for part in parts}
+
+
+def rows(part):
+    """Return the cells of a section's table, without its header."""
+    lines = [x for x in part.splitlines() if x.startswith("|")][2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]

@@ -165,9 +165,7 @@ def test_orbits_sweeps_scans_and_basins_agree_with_runs_of_scalars():
         np.testing.assert_allclose(scan[ours], last, rtol=0, atol=1e-11)
     sweep = vi.sweep(MACHINE, "gap", [0.6], settle=200, cycles=4)
     np.testing.assert_allclose(sweep.y_min[0], orbit.y_min, rtol=0, atol=1e-11)
-    basins = vi.basins(
-        MACHINE, {"start.q[1]": (-0.5, 0.5)}, resolution=4, longest=8, progress=False
-    )
+    basins = vi.basins(MACHINE, {"start.q[1]": (-0.5, 0.5)}, resolution=4, longest=8)
     (basin,) = basins.attractors
     assert (basin.starts, basin.period) == (4, 1)
     for name, value in zip(("q[0]", "q[1]", "v[0]", "v[1]"), table(end), strict=True):

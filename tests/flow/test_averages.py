@@ -82,25 +82,6 @@ def test_mean_speed_of_a_motor_is_one_turn_in_a_cycle():
     np.testing.assert_allclose(mean, 8 * 2 * np.pi / run.duration.sum(), rtol=1e-14)
 
 
-@pytest.mark.slow
-def test_derivatives_through_impacts():
-    """Compare with finite differences. The derivatives of the energy defect are zero."""
-
-    def power(x):
-        machine = Shaken(amplitude=x[0], frequency=x[1], gap=x[2], restitution=x[3])
-        run = vi.simulate(machine, begin(), 6, method=vi.Taylor())
-        return run.averages["taken"], energy_defects(run)
-
-    at, alone = jnp.array([1.0, 0.8, 0.5, 0.6]), vi.jit(lambda x: power(x)[0])
-    slopes, left = vi.jit(jax.jacfwd(power))(at)
-    np.testing.assert_allclose(left, 0.0, atol=1e-8)
-    for i, h in enumerate(1e-6 * jnp.eye(4)):
-        between = (alone(at + h) - alone(at - h)) / 2e-6
-        np.testing.assert_allclose(slopes[:, i], between, rtol=2e-6, atol=2e-7)
-    back = vi.jit(jax.grad(lambda x: power(x)[0][-1]))(at)
-    np.testing.assert_allclose(back, slopes[-1], rtol=1e-11)
-
-
 class Sawtooth(NamedTuple):
     place: jax.Array
 

@@ -43,14 +43,12 @@ class Ball(AbstractMachine):
 # Values: the scene as a function of the lane's parameter, the method, options of `simulate`.
 CASES = {
     "cycles that an impact ends": (
-        lambda r: Ball(0.6 * r),
-        vi.Adaptive(),
-        {"record": "sections", "rests": False},
+        lambda r: Ball(0.6 * r), vi.Adaptive(), {"record": "sections", "rests": False},
     ),
     "exact flight": (ideal, vi.ExactFlight(), {}),
     "exact flight, rest": (lambda r: ideal(0.4 * r, PRESSED), vi.ExactFlight(), {}),
     "motor": (motor, vi.FixedStep(), {}),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", quick(CASES, "cycles that an impact ends", "exact flight"))

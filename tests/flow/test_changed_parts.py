@@ -63,14 +63,11 @@ def test_changed_equations_have_no_closed_form(machine, what):
 @pytest.mark.parametrize(
     "machine, may",
     [
-        (scene(), False),
-        (scene(gap=0.9), True),
-        (scene(crank=Wide), True),
-        (scene(drive=Weighted), True),
-        (scene(Pulled), True),
+        (scene(), False), (scene(gap=0.9), True), (scene(crank=Wide), True),
+        (scene(drive=Weighted), True), (scene(Pulled), True),
         (scene(soft=(vi.SoftStop(0.8, 10.0, side="left"),)), True),
     ],
-)
+)  # fmt: skip
 def test_may_rest_if_a_force_can_press_the_body_on_a_stop(machine, may):
     assert machine.may_rest() is may
 

@@ -12,10 +12,9 @@ MOTOR = vi.Parameters(torque=10.0, restitution=0.8, gap=0.08, control=1.1).scene
 
 
 def test_presets_by_scene():
-    assert all(
-        isinstance(vi.preset(IDEAL, n), vi.ExactFlight) for n in ("draft", "standard", "reference")
-    )
-    steps = [vi.preset(MOTOR, name).steps_per_cycle for name in ("draft", "standard", "reference")]
+    names = "draft", "standard", "reference"
+    assert all(isinstance(vi.preset(IDEAL, name), vi.ExactFlight) for name in names)
+    steps = [vi.preset(MOTOR, name).steps_per_cycle for name in names]
     assert steps == sorted(steps) and len(set(steps)) == 3
     assert chosen(MOTOR, None).steps_per_cycle == vi.preset(MOTOR).steps_per_cycle
     with pytest.raises(ValueError, match="'draft', 'standard', 'reference', but got 'fast'"):

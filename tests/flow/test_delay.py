@@ -102,17 +102,6 @@ def test_linear_equation_is_exact():
     np.testing.assert_allclose(run.sections.x[4], -4.606955991e-4, rtol=0, atol=1e-12)
 
 
-def test_impacts_with_feedback():
-    run = vi.simulate(Struck(), cycles=50, impact_log=3)
-    end = [run.sections.x[jnp.array([5, 50])], run.sections.u[jnp.array([5, 50])]]
-    wanted = [[-0.3721662410390, -0.3631911832734], [-0.7218104265337, -0.7155667014084]]
-    np.testing.assert_allclose(end, wanted, rtol=0, atol=1e-9)
-    assert int(run.impacts.sum()) == 51
-    times = np.asarray(run.impact_log.phase)
-    times = [times[0, 0], times[0, 1], times[1, 0] + 2 * np.pi / 0.8]
-    np.testing.assert_allclose(times, [1.2897849071, 6.6933253587, 14.8037714534], atol=1e-9)
-
-
 def test_derivative_with_respect_to_a_delay():
     class Lagged(Linear):
         lag: float = 1.0
@@ -157,33 +146,24 @@ def test_turning_tool_leaves_the_cut():
     np.testing.assert_allclose(instants, [84.0632905055, 84.5797966961], atol=1e-9)
 
 
-def test_random_machines_with_two_delays():
-    p, one = random_machines(3, 1), ["x", "u"]
+@pytest.mark.parametrize(
+    ("number", "method", "close"),
+    [(3, None, 2e-9), pytest.param(10, "reference", 1e-9, marks=pytest.mark.slow)],
+)
+def test_random_machines_with_two_delays(number, method, close):
+    p = random_machines(number, 1)
+    if number > 3:
+        p["delay"][0] = 2 * np.pi / p["omega"][0]  # images of impacts coincide with impacts
 
     def end(p):
-        run = vi.simulate(Two(**p), cycles=CYCLES)
-        return jnp.array([getattr(run.last, name) for name in one]), run.impacts.sum()
+        run = vi.simulate(Two(**p), cycles=CYCLES, method=method)
+        return jnp.array([run.last.x, run.last.u]), run.impacts.sum()
 
     ends, impacts = jax.jit(jax.vmap(end))({name: jnp.asarray(x) for name, x in p.items()})
-    for i in range(3):
+    for i in range(number):
         state, events = two_by_steps({name: x[i] for name, x in p.items()})
         assert len(events) == int(impacts[i])
-        np.testing.assert_allclose(ends[i], state, rtol=0, atol=2e-9)
-
-
-@pytest.mark.slow
-def test_more_random_machines_and_a_delay_of_one_cycle():
-    p = random_machines(10, 2)
-    p["delay"][0] = 2 * np.pi / p["omega"][0]  # images of impacts coincide with impacts
-
-    def end(p):
-        last = vi.simulate(Two(**p), cycles=CYCLES, method="reference").last
-        return jnp.array([last.x, last.u])
-
-    ends = jax.jit(jax.vmap(end))({name: jnp.asarray(x) for name, x in p.items()})
-    for i in range(10):
-        state, _ = two_by_steps({name: x[i] for name, x in p.items()})
-        np.testing.assert_allclose(ends[i], state, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(ends[i], state, rtol=0, atol=close)
 
 
 @pytest.mark.slow

@@ -229,34 +229,6 @@ def test_two_bodies_land_together_as_a_cycle_ends():
     assert int(run.impacts[0]) == 2
 
 
-class WithIdleReset(vi.AbstractMachine):
-    """An oscillator with a stop, and a reset that never happens."""
-
-    gap: Any
-    cycle: float = 2 * np.pi / 0.9
-    events: tuple = (vi.Reset(lambda m, s, x: x.Y - 9, lambda m, s, x: x),)
-
-    @property
-    def contacts(self):
-        return (vi.RigidStop(self.gap, 0.7),)
-
-    def field(self, s, x):
-        return vi.OscillatorState(x.V, jnp.cos(0.9 * s) - x.Y - 0.1 * x.V)
-
-
-@pytest.mark.slow
-def test_derivatives_of_extremes_with_events():
-    def extremes(gap):
-        run = vi.simulate(WithIdleReset(gap), vi.OscillatorState(0 * gap, 0 * gap), 3, method=CLOSE)
-        return run.y_max[-1], run.y_min[-1]
-
-    h = 1e-5
-    gaps = 0.5 + h * jnp.array([-1.0, 0.0, 1.0])
-    (_, lowest), (top, low) = jax.jvp(jax.vmap(extremes), (gaps,), (jnp.ones(3),))
-    np.testing.assert_allclose(top, 1.0, atol=1e-12)
-    assert float(low[1]) == pytest.approx(float(lowest[2] - lowest[0]) / (2 * h), rel=1e-6)
-
-
 class WithReset(vi.AbstractMachine):
     """y'' = 2 - y, with a reset at y = 1."""
 

@@ -105,26 +105,6 @@ def test_error_is_at_most_ten_tolerances():
 
 
 @pytest.mark.slow
-def test_strong_motor_approaches_the_ideal_drive():
-    """The difference falls as 1/τ0. The strongest motor needs more steps than allowed."""
-    method = vi.Adaptive(rtol=1e-11)
-    stops, oscillator = (vi.RigidStop(2.0, 0.5),), 0.05
-    still = vi.Scene(oscillator, vi.IdealDrive(0.9), stops)
-    limit = vi.simulate(still, still.start(), 3).last
-
-    @vi.jit
-    @jax.vmap
-    def last(strength):
-        scene = vi.Scene(oscillator, vi.Motor(strength, 0.9, 0.01, 0.005), stops)
-        run = vi.simulate(scene, scene.start(), 3, method=method)
-        return jnp.maximum(abs(run.last.Y - limit.Y), abs(run.last.V - limit.V)), run.result
-
-    off, result = last(jnp.array([1e3, 1e4, 1e6]))
-    assert float(off[0] / off[1]) == pytest.approx(10, rel=0.02)
-    assert (result == vi.RESULTS.max_steps).tolist() == [False, False, True]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("method", [vi.ExactFlight(), vi.FixedStep(), vi.Adaptive(rtol=1e-11)])
 def test_narrow_gap_between_stops(method):
     """Two stops are 1e-6 apart, and the body rests twice in each cycle."""

@@ -1,6 +1,9 @@
-"""Parameters of a machine, floats or arrays, can change without a new compilation."""
+"""Programs serve other parameters and later processes, but never another machine."""
 
 import importlib
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -14,11 +17,8 @@ import vi_jax as vi
 from vi_jax.machine import by_name, with_leaf
 
 NUMBERS = [
-    *map(float, np.linspace(1.05, 1.15, 7)),
-    np.float64(1.16),
-    jnp.asarray(1.17),
-    np.array(1.18),
-]
+    *map(float, np.linspace(1.05, 1.15, 7)), np.float64(1.16), jnp.asarray(1.17), np.array(1.18),
+]  # fmt: skip
 
 
 class Law(eqx.Module):
@@ -102,3 +102,46 @@ def test_float_written_as_an_integer_is_not_truncated():
     same = replace(machine, shaking=1.5)
     a, b = (vi.simulate(m, m.start(), 11).last.Y for m in (machine, same))
     assert float(machine.shaking) == 1.5 and float(a) == float(b)
+
+
+RUN = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+import vi_jax as vi
+
+print(vi.keep_programs())
+STIFFNESS = float(sys.argv[1])
+
+class Body(vi.Mechanical):
+    q = ("x",)
+    cycle = 3.0
+
+    def mass(self, q):
+        return 1.0
+
+    def force(self, t, q, v):
+        return dict(x=-STIFFNESS * q.x)
+
+print(float(vi.simulate(Body(), Body().at(x=1.0)).last.x))
+"""
+
+
+def test_a_changed_global_gives_the_new_motion_with_a_warm_cache(tmp_path):
+    unset = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
+    environment = {k: x for k, x in os.environ.items() if k not in unset}
+    environment |= {"XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
+
+    def found(stiffness):
+        command = [sys.executable, "-c", RUN, str(stiffness)]
+        out = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        folder, x = out.stdout.split()
+        assert folder == str(tmp_path / "vi_jax") and not out.stderr
+        return float(x), {path for path in (tmp_path / "vi_jax").rglob("*") if path.is_file()}
+
+    first, files = found(4.0)
+    assert first == pytest.approx(0.9601702866503661, abs=1e-8)  # cos 6
+    assert any(path.suffix == ".o" for path in files)
+    second, more = found(1.0)
+    assert second == pytest.approx(-0.9899924966004454, abs=1e-8) and more > files  # cos 3
+    assert found(4.0) == (first, more)

@@ -91,30 +91,6 @@ def test_the_path_is_the_linear_flow_with_jumps_between():
     np.testing.assert_allclose(here, found, atol=1e-9)
 
 
-def test_impulses_are_the_same_in_phase_and_in_time():
-    """One cycle takes a phase of 2π and a time of π."""
-
-    class Sooner(Free):
-        cycle = np.pi
-
-    forced = vi.machines.Duffing(amplitude=0.0, frequency=2.0, damping=0.2, gap=50.0)
-    here, there = (
-        vi.simulate(machine, START, 4, noise=white_noise(), key=KEYS[3], record="sections").sections
-        for machine in (forced, Sooner())
-    )
-    np.testing.assert_allclose(here.V, there.V, atol=1e-9)
-    np.testing.assert_allclose(here.Y, there.Y, atol=1e-9)
-
-
-def test_path_depends_only_on_its_key(many):
-    V = np.asarray(many.sections.V)
-    assert np.array_equal(paths(KEYS[5:6]).sections.V[0], V[5])
-    assert np.array_equal(paths(KEYS[::-1]).sections.V[::-1], V)
-    with vi.threads(1):
-        assert np.array_equal(paths().sections.V, V)
-    assert len(np.unique(V[:, 1])) == len(V)
-
-
 def test_samples_do_not_change_the_path(many):
     V = np.asarray(many.sections.V)
     np.testing.assert_allclose(paths(samples=4).sections.V, V, atol=1e-11)
@@ -234,11 +210,7 @@ VALVE = vi.machines.ReliefValve(flow_rate=5.0)
         (walled(), {"noise": vi.WhiteNoise({"Y": 0.5})}, "must change velocities only"),
         (walled(), {"noise": vi.WhiteNoise({"V": jnp.array([0.5, 1.0])})}, "one amplitude"),
         (walled(), {"noise": vi.WhiteNoise({"V": lambda x: jnp.ones(2)})}, "one returns shape"),
-        (
-            walled(),
-            {"noise": vi.WhiteNoise({"V": lambda x: 1j})},
-            "must hold real numbers, but its",
-        ),
+        (walled(), {"noise": vi.WhiteNoise({"V": lambda x: 1j})}, "must hold real numbers, but"),
         (VALVE, {}, r"as `machine.observed_every\(interval\)`"),
         (Reset(), {}, "without resets"),
     ],

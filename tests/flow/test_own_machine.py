@@ -95,9 +95,7 @@ def test_samples_cost_nothing_while_settling():
 @pytest.mark.parametrize("cycle", [0.0, -1.0, np.nan])
 def test_invalid_cycle_raises(cycle):
     start, machine = Ball(*map(jnp.asarray, (1.0, 0.3))), Shaken(jnp.asarray(1.0), (), 1.0, cycle)
-    with pytest.raises(
-        ValueError, match=f"`cycle` of a Shaken must be positive .*, but is {cycle}"
-    ):
+    with pytest.raises(ValueError, match=f"`cycle` of a Shaken must be positive .*but is {cycle}"):
         vi.simulate(machine, start, 1)
 
 

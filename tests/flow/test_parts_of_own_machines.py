@@ -84,13 +84,6 @@ def test_more_than_63_outcomes():
         check_parts(Ending(5000))
 
 
-class Turning(vi.AbstractMachine):
-    cycle = vi.turn_of("phi", usual=2 * np.pi)
-
-    def field(self, t, z):
-        return dict(phi=z.w, w=0.0 * z.w)
-
-
 class Arrays(vi.AbstractMachine):
     cycle = 1.0
 
@@ -134,7 +127,6 @@ BODY = vi.State(x=0.1, u=0.0)
 @pytest.mark.parametrize(
     ("machine", "start", "kind", "words"),
     [
-        (Turning(), vi.State(phi=2 * np.pi, w=1.0), ValueError, "phi before the end of a turn"),
         (Arrays(), vi.State(x=jnp.ones(3)), ValueError, r"`def position\(self, z\): return z.x"),
         (Toggled(), BODY, TypeError, r"declare them: `modes = dict\(k=0.0\)`"),
         (Compliant(), BODY, TypeError, r"`exponent` .* compile-time constant.*static=True"),
@@ -162,13 +154,11 @@ class Circuit(vi.AbstractMachine):
 class Pair(vi.AbstractMachine):
     cycle = 1.0
     contacts = (
-        vi.RigidStop(0.5, 0.6, on=("a", "u")),
-        vi.RigidStop(0.3, 0.6, on=("b", "v")),
+        vi.RigidStop(0.5, 0.6, on=("a", "u")), vi.RigidStop(0.3, 0.6, on=("b", "v")),
         vi.RigidStop(0.9, 0.6, on=("b", "v"), name="buffer"),
-        vi.RigidStop(0.3, 0.6, "left", on=("b", "v")),
-        vi.SoftStop(0.8, 1.0, on=("b", "v")),
+        vi.RigidStop(0.3, 0.6, "left", on=("b", "v")), vi.SoftStop(0.8, 1.0, on=("b", "v")),
         vi.SoftStop(0.9, 1.0, on=("b", "v")),
-    )
+    )  # fmt: skip
 
     def field(self, t, z):
         return dict(a=z.u, b=z.v, u=-z.a, v=-z.b)
@@ -247,9 +237,7 @@ def test_a_load_with_another_period_is_named_if_cycles_repeat():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run = vi.simulate(Loaded(), start, 1, event_log=2)
-    with pytest.warns(
-        UserWarning, match=r"`contacts` of a Loaded are not the same.*force on its u"
-    ):
+    with pytest.warns(UserWarning, match=r"`contacts` of a Loaded are not the same.*force on its"):
         vi.simulate(Loaded(), start, 2)
     assert "switch" not in str(run.event_log)
     with pytest.raises(TypeError, match=r"Compare it with `vi.RESULTS.successful`"):

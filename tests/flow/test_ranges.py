@@ -13,24 +13,19 @@ from vi_jax.flow.results import code as code_of
 
 CYCLES = 3
 BASE = vi.Scene(
-    damping_ratio=0.05,
-    drive=vi.Motor(0.6, 0.9, 0.01, 0.005),
-    stops=[vi.RigidStop(2.0, 0.5), vi.RigidStop(2.5, 0.5, "left")],
-    crank=vi.SliderCrank(1 / 3),
+    damping_ratio=0.05, drive=vi.Motor(0.6, 0.9, 0.01, 0.005),
+    stops=[vi.RigidStop(2.0, 0.5), vi.RigidStop(2.5, 0.5, "left")], crank=vi.SliderCrank(1 / 3),
     section_phase=0.1,
-)
+)  # fmt: skip
 PLACES = {
     "restitution": lambda s: s.stops[0].restitution,
     "left restitution": lambda s: s.stops[1].restitution,
-    "damping_ratio": lambda s: s.damping_ratio,
-    "ratio": lambda s: s.crank.ratio,
-    "strength": lambda s: s.drive.strength,
-    "coupling": lambda s: s.drive.coupling,
+    "damping_ratio": lambda s: s.damping_ratio, "ratio": lambda s: s.crank.ratio,
+    "strength": lambda s: s.drive.strength, "coupling": lambda s: s.drive.coupling,
     "slider_inertia": lambda s: s.drive.slider_inertia,
-    "no_load_speed": lambda s: s.drive.no_load_speed,
-    "section_phase": lambda s: s.section_phase,
+    "no_load_speed": lambda s: s.drive.no_load_speed, "section_phase": lambda s: s.section_phase,
     "gap": lambda s: s.stops[1].gap,
-}
+}  # fmt: skip
 # The last gap leaves no room to the other stop at 2.
 OUTSIDE = [2.0, -0.1, -0.9, -0.5, -1.0, -1.0, -1.0, 0.0, 7.0, -2.0]
 

@@ -9,47 +9,12 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
-from scipy.linalg import expm
 
-METHODS = [vi.ExactFlight(), vi.Adaptive(rtol=1e-11), vi.FixedStep(steps_per_cycle=64)]
-IDS = ["exact", "adaptive", "fixed"]
 GAP, K, ZETA, XI = 0.3, 0.4, 0.3, 0.05
 
 
 def scene(zeta=ZETA, k=K, gap=GAP, xi=XI):
     return vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=gap, damping_ratio=xi)
-
-
-class Ground(vi.AbstractMachine):
-    """A ball on the ground."""
-
-    gravity: jax.Array
-    contacts: tuple[vi.RigidStop, ...]
-    cycle: float = 10.0
-
-    def field(self, s, state):
-        return vi.OscillatorState(state.V, -self.gravity)
-
-
-def test_a_bouncing_ball_rests_after_the_time_of_the_series():
-    # The fall takes t, flight n takes 2 kⁿ t; in total the ball needs t (1 + k)/(1 - k).
-    height, ks = 0.5, np.array([0.0, 0.3, 0.8])
-
-    def run(k):
-        ground = Ground(jnp.asarray(2.0), (vi.RigidStop(0.0, k, "left"),))
-        start = vi.OscillatorState(*map(jnp.asarray, (height, 0.0)))
-        return vi.simulate(ground, start, 1, method=vi.Adaptive(rtol=1e-12), impact_log=80)
-
-    found = jax.vmap(run)(jnp.asarray(ks))
-    assert bool(found.successful.all()) and (found.rests == 1).all()
-    assert (found.sections.Y[:, -1] == 0).all() and (found.sections.V[:, -1] == 0).all()
-    for i, k in enumerate(ks):
-        times = np.asarray(found.impact_log.phase[i, 0])[found.impact_log.stop[i, 0] >= 0]
-        fall = np.sqrt(2 * height / 2.0)
-        # The remaining flights of the series begin with this one.
-        last = 2 * fall * k ** len(times)
-        assert times[-1] + last / (1 - k) == pytest.approx(fall * (1 + k) / (1 - k), abs=1e-9)
-        assert len(times) <= 2 + np.log(1e-6) / np.log(max(k, 1e-6))
 
 
 class Lifted(vi.AbstractMachine):
@@ -122,26 +87,6 @@ def test_the_instant_of_rest_gets_better_with_the_tolerance(rtol, error):
     log = run.event_log
     rest = log.phase[log.kind == vi.EVENTS.index("rest")]
     np.testing.assert_allclose(rest, time, rtol=0, atol=error)
-
-
-@pytest.mark.parametrize("method", METHODS, ids=IDS)
-def test_release_when_the_crank_no_longer_presses(method):
-    # U = cos φ > d presses the body on the stop. It leaves at φ = arccos d and then moves as the
-    # linear oscillator from rest.
-    body = scene()
-    run = vi.simulate(body, body.start(Y=0.1), 3, method=method, samples=200)
-    assert bool(run.successful) and np.asarray(run.rests).tolist() == [2, 1, 1]
-    Y = np.asarray(run.samples.state.Y)[400:]
-    angle = 2 * np.pi * np.arange(201) / 200
-    release = np.arccos(GAP)
-    assert (Y[angle < release] == GAP).all()
-    A = np.zeros((4, 4))
-    A[0, 1], A[1, 0], A[1, 1], A[1, 2] = 1, -1, -2 * XI, 1
-    A[2, 3], A[3, 2] = -ZETA, ZETA
-    begin = np.array([GAP, 0.0, np.cos(release), np.sin(release)])
-    flight = (angle > release) & (angle < release + 1.2)
-    times = (angle[flight] - release)[:, None, None] / ZETA
-    np.testing.assert_allclose(Y[flight], (expm(A * times) @ begin)[:, 0], atol=1e-9)
 
 
 @pytest.mark.slow

@@ -151,12 +151,8 @@ def machine(drive, clock, stops):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("drive", "clock", "sides"),
-    [
-        ("ideal", "time", 2),
-        ("motor", "phase", 1),
-        ("motor", "time", 2),
-    ],
-)
+    [("ideal", "time", 2), ("motor", "phase", 1), ("motor", "time", 2)],
+)  # fmt: skip
 def test_matches_scipy_over_gaps_restitutions_stops_and_clocks(drive, clock, sides):
     """Every gap with every restitution, from rest on the stop and from a moving start."""
     cycles = 2
@@ -177,9 +173,8 @@ def test_matches_scipy_over_gaps_restitutions_stops_and_clocks(drive, clock, sid
     found = vi.jit(jax.vmap(lane))(*map(jnp.asarray, np.array(cases).T))
     for (d, k, off), states, low, high, rests, good in zip(cases, *found, strict=True):
         start = (d - off, 2 * off, 0.9)[: states.shape[1]]
-        expected = truth.integrated(
-            MOTOR if drive == "motor" else 0.9, 0.05, walls(d, k), start, cycles
-        )
+        turning = MOTOR if drive == "motor" else 0.9
+        expected = truth.integrated(turning, 0.05, walls(d, k), start, cycles)
         where = f"d = {d}, k = {k}, start {start}"
         assert bool(good), where
         np.testing.assert_allclose(states, expected.sections, atol=1e-7, err_msg=where)

@@ -41,10 +41,8 @@ def relief_valve() -> Expected:
     def special(rate: float, bounds: tuple[float, float]) -> vi.Point:
         valve = vi.machines.ReliefValve(flow_rate=rate)
         settled = vi.simulate(valve, valve.start(), 1, settle=400).last
-        branch = vi.continue_orbit(
-            vi.find_orbit(valve, settled), parameter="flow_rate", bounds=bounds
-        )
-        return branch.special[0]
+        orbit = vi.find_orbit(valve, settled)
+        return vi.continue_orbit(orbit, parameter="flow_rate", bounds=bounds).special[0]
 
     return {
         "Hopf, q": (float(brentq(growth, 8.0, 9.0)), 1e-6),

@@ -38,11 +38,9 @@ def swept(settle):
 
 WAYS = {
     "simulate": lambda settle: vi.simulate(SCENE, SCENE.start(), 1, settle=settle).last.Y,
-    "jit": lambda settle: quick(0.1, settle),
-    "vmap": lambda settle: lanes(STARTS, settle),
-    "grad": lambda settle: slope(0.1, settle),
-    "sweep": swept,
-}
+    "jit": lambda settle: quick(0.1, settle), "vmap": lambda settle: lanes(STARTS, settle),
+    "grad": lambda settle: slope(0.1, settle), "sweep": swept,
+}  # fmt: skip
 
 
 def time_to_end(way, delay):

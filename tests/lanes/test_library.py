@@ -16,6 +16,7 @@ def as_lanes(function, numbers):
 
 # Functions of the C library: in JAX, in extended precision, and ranges of their arguments.
 LIBRARY = {
+    "exp": (jnp.exp, np.exp, [(-2, 2), (-700, 700)]),
     "tanh": (jnp.tanh, np.tanh, [(-1, 1), (-25, 25)]),
     "expm1": (jnp.expm1, np.expm1, [(-2, 2), (-750, 750)]),
     "log1p": (jnp.log1p, np.log1p, [(-1, 1), (0, 50)]),

@@ -131,27 +131,6 @@ def test_derivatives_of_a_branch_with_more_inputs_than_its_value(monkeypatch, mo
         np.testing.assert_allclose(along(order, lane)(x), along(order, closed)(x), rtol=1e-14)
 
 
-@pytest.mark.slow
-def test_reverse_derivatives_agree_with_forward_ones():
-    """Derivatives of results and rows, with respect to inputs per lane and shared ones."""
-
-    def sums(x, r, backend=None):
-        (last, *_), rows = jax.vmap(lambda x: logistic(x, r, 6.0, backend=backend))(x)
-        return jnp.stack([jnp.sum(jnp.sin(last)), jnp.sum(rows["x"][:, :3] ** 2)])
-
-    x = jnp.linspace(0.1, 0.9, 11)
-    for backend in (None, "xla"):
-        for which in (0, 1):
-            forward = jax.jacfwd(sums, which)(x, 3.7, backend)
-            backward = jax.jacrev(sums, which)(x, 3.7, backend)
-            np.testing.assert_allclose(backward, forward, rtol=1e-12, atol=1e-12)
-    many = jnp.linspace(0.1, 0.9, 20)
-    slope = jax.grad(lambda w: jnp.sum(jnp.sin(logistic(w @ many, 3.7, 6.0)[0][0])))(
-        jnp.ones(20) / 40
-    )
-    np.testing.assert_allclose(slope / many, slope[0] / many[0], rtol=1e-12)
-
-
 def test_linearize_and_stop_gradient():
     def last(x):
         return logistic(x, 3.7, 6.0)[0][0]

@@ -106,68 +106,6 @@ def test_contact_friction_equals_dry_friction_under_the_same_load(lift):
         np.testing.assert_allclose(a, b, atol=1e-8)
 
 
-class Coupled(vi.Mechanical):
-    """Two coordinates coupled by the mass matrix, as for a rod whose end hits a floor."""
-
-    q = ("x", "y")
-    mass = ((1.0, 0.7), (0.7, 1.0))
-    cycle = 1.0
-    contacts = vi.RigidStop(0.0, 0.9, "left", on="y", friction=0.5, along="x")
-
-    def force(self, t, q, v):
-        return dict(x=0.0, y=0.0)
-
-
-def impacts_of(before, restitution, mass, mu):
-    """Return all velocities (along, across) after an impact that fulfil Newton's and Coulomb's
-    laws: a linear complementarity problem, solved by trying its cases."""
-    inverse, found = np.linalg.inv(mass), []
-    target = np.array([0.0, -restitution * before[1]])
-    stick = np.linalg.solve(inverse, target - before)
-    if stick[1] >= 0 and abs(stick[0]) <= mu * stick[1]:
-        found.append(before + inverse @ stick)
-    for way in (1, -1):
-        impulse = np.array([-way * mu, 1.0])
-        impulse = impulse * (target - before)[1] / (inverse @ impulse)[1]
-        after = before + inverse @ impulse
-        if impulse[1] >= 0 and way * after[0] > 0:
-            found.append(after)
-    return found
-
-
-@pytest.mark.slow
-def test_an_impact_gains_no_energy():
-    """Newton's law across a stop and Coulomb's law along it may add energy if the mass matrix
-    couples both velocities (Kane's paradox). Then the result is the mean of those with and without
-    restitution that keeps the energy."""
-    machine = Coupled()
-    mu, k, mass = 0.5, 0.9, np.array([[1, 0.7], [0.7, 1]])  # of (x, y)
-    slips = np.linspace(-3, 3, 25)
-
-    def last(u):
-        run = vi.simulate(machine, machine.at(y=0.5, v=dict(x=u, y=-1.0)), 1)
-        return run.last.v.x, run.last.v.y, run.successful, run.impact_energy[0]
-
-    u, v, good, lost = (np.asarray(x) for x in jax.vmap(last)(jnp.asarray(slips)))
-    assert good.all()
-    limited = 0
-    for i, slip in enumerate(slips):
-        before = np.array([slip, -1.0])
-        ((inelastic,), (full,)) = (impacts_of(before, e, mass, mu) for e in (0.0, k))
-        after = np.array([u[i], v[i]])
-        energy, old = after @ mass @ after / 2, before @ mass @ before / 2
-        assert lost[i] == pytest.approx(old - energy, abs=1e-12)
-        if full @ mass @ full / 2 > old * (1 + 1e-9):
-            share = v[i] / k  # the speed after an impact without restitution is 0
-            assert 0 < share < 1 and abs(energy - old) < 1e-12
-            expected = inelastic + share * (full - inelastic)
-            limited += 1
-        else:
-            expected = full
-        np.testing.assert_allclose(after, expected, atol=1e-10)
-    assert 0 < limited < 20
-
-
 class Kane(vi.Mechanical):
     """Coordinates along and across a floor, coupled by their masses (T. R. Kane)."""
 

@@ -9,8 +9,6 @@ import pytest
 import vi_jax as vi
 from scipy.optimize import brentq
 
-from rubbing import Block
-
 
 class Oscillator(vi.AbstractMachine):
     omega: float = 0.9
@@ -20,37 +18,6 @@ class Oscillator(vi.AbstractMachine):
 
     def field(self, t, z):
         return dict(x=z.u, u=jnp.cos(self.omega * t) - z.x - 0.1 * z.u)
-
-
-class Stack(vi.Mechanical):
-    """A body on rough ground, with a second body on top."""
-
-    q = ("a", "b")
-    mass = (1.0, 1.0)
-    cycle = 2 * jnp.pi / 0.3
-    contacts = (vi.DryFriction(0.4, on="a"), vi.DryFriction(0.1, on=lambda q: q.b - q.a))
-
-    def force(self, t, q, v):
-        return dict(a=jnp.cos(0.3 * t) - q.a, b=0.0)
-
-
-def numbers(state):
-    return np.array([float(x) for x in jax.tree.leaves(state)])
-
-
-def test_friction_on_a_floor_that_a_body_hits():
-    machine = Block(0.3, 0.4, pull=0.5)
-    run = vi.simulate(machine, machine.at(y=0.1, v=dict(x=0.5)), 10)
-    assert int(run.impacts.sum()) == 13
-    np.testing.assert_allclose(numbers(run.last), [0.952123292, 0, 0.121811435, 0], atol=2e-8)
-
-
-def test_two_frictions_that_stick_together():
-    """Both contacts must be decided together, as the friction of each acts on both bodies."""
-    machine = Stack()
-    run = vi.simulate(machine, machine.at(a=0.1), 2, event_log=16)
-    assert bool(run.successful) and int((run.event_log.kind >= 0).sum()) == 24
-    np.testing.assert_allclose([run.last.a, run.last.b], [0.940773005, 0.534904081], atol=1e-8)
 
 
 class Cart(vi.Mechanical):

@@ -81,41 +81,6 @@ class Buffered(SliderCrank):
         return super().contacts, buffer
 
 
-class Rotor(vi.Mechanical):
-    """An unbalanced motor on a structure with a stop."""
-
-    q = ("x", "phi")
-    unbalance: float = 0.1
-    cycle = 60 * jnp.pi
-    contacts = vi.RigidStop(0.3, 0.8, on="x")
-
-    def mass(self, q):
-        across = -self.unbalance * jnp.sin(q.phi)
-        return [[1.0, across], [across, 1.0]]
-
-    def force(self, t, q, v):
-        return dict(x=-q.x - 0.1 * v.x, phi=0.1 * (1.3 - v.phi))
-
-
-def test_two_bodies_and_a_wall():
-    machine = Pair()
-    run = vi.simulate(machine, machine.at(left=-0.5, right=0.3), 10)
-    assert int(run.impacts.sum()) == 29
-    z = run.last
-    wanted = [0.457113976, 0.698178941, 0.119586666, 1.344958219]
-    np.testing.assert_allclose([z.left, z.right, z.v.left, z.v.right], wanted, atol=2e-9)
-
-
-def test_an_unbalanced_motor_on_a_structure():
-    """Impacts change the speed of the shaft through the mass matrix."""
-    machine = Rotor()
-    run = vi.simulate(machine, machine.at(v=dict(phi=1.3)), 1)
-    z = run.last
-    wanted = [-0.26480944, 224.81444031, 0.26836301, 1.19184148]
-    np.testing.assert_allclose([z.x, z.phi, z.v.x, z.v.phi], wanted, atol=2e-8)
-    assert int(run.impacts.sum()) == 35
-
-
 @pytest.mark.slow
 def test_the_machine_of_the_paper():
     """Compare states, impact energies and events with `Scene` in both clocks."""
@@ -155,9 +120,6 @@ def test_turns_of_a_motor_are_its_cycles():
     assert float(orbit.duration) == pytest.approx(float(wanted.duration) / omega, rel=1e-9)
     found, other = (np.sort(abs(x.multipliers))[::-1] for x in (orbit, wanted))
     np.testing.assert_allclose(found[:3], other, atol=1e-8)
-    exponents = vi.lyapunov(machine, orbit.state, 100, progress=False).exponents
-    decay = np.log(found[:3]) / float(orbit.duration)
-    np.testing.assert_allclose(exponents, [0, *decay], rtol=2e-2, atol=1e-2)
 
 
 class Table(vi.Mechanical):
@@ -215,12 +177,12 @@ def test_a_rest_on_a_moving_table_is_lost_where_that_in_the_distance_is():
         last = vi.simulate(machine, start, 1, settle=50).last
         orbit = vi.find_orbit(machine, last, impact_log=40, throw=True)
         name = next(x for x in ("shaking", "acceleration") if hasattr(machine, x))
-        branch = vi.continue_orbit(orbit, parameter=name, bounds=(1.01, 1.5), progress=False)
+        branch = vi.continue_orbit(orbit, parameter=name, bounds=(1.19, 1.4), progress=False)
         return branch.ends, [(x.kind, x.parameter) for x in branch.special]
 
-    table = Table(shaking=1.1, restitution=0.7)
-    ball = vi.machines.BouncingBall(acceleration=1.1, restitution=0.7)
-    ends, special = found(table, table.at(ball=-1.1))
+    table = Table(shaking=1.2, restitution=0.7)
+    ball = vi.machines.BouncingBall(acceleration=1.2, restitution=0.7)
+    ends, special = found(table, table.at(ball=-1.2))
     wanted_ends, wanted = found(ball, ball.start(height=0.0))
     assert ends == wanted_ends and [x for x, _ in special] == [x for x, _ in wanted] == ["rest"]
     np.testing.assert_allclose(special[0][1], wanted[0][1], atol=1e-9)
@@ -280,10 +242,7 @@ def test_a_mass_matrix_of_three():
         q = ("s", "x[2]")
         mass = (1.0, np.array([2.0, 3.0]))
         cycle = 2 * jnp.pi
-        contacts = (
-            vi.RigidStop(0.1, 0.5, on="x[1]"),
-            vi.DryFriction(0.2, on=lambda q: q.x[0] - q.s),
-        )
+        contacts = vi.RigidStop(0.1, 0.5, on="x[1]"), vi.DryFriction(0.2, on=lambda q: q.x[0] - q.s)
 
         def force(self, t, q, v):
             return dict(s=jnp.cos(t) - q.s, x=0.5 * jnp.sin(t) * jnp.arange(2) - q.x)
@@ -294,10 +253,7 @@ def test_a_mass_matrix_of_three():
         q = ("x", "r", "s")
         mass = ((6.0, 5.0, 3.0), (5.0, 5.0, 3.0), (3.0, 3.0, 3.0))
         cycle = 2 * jnp.pi
-        contacts = (
-            vi.RigidStop(0.1, 0.5, on=lambda q: q.x + q.r + q.s),
-            vi.DryFriction(0.2, on="r"),
-        )
+        contacts = vi.RigidStop(0.1, 0.5, on=lambda q: q.x + q.r + q.s), vi.DryFriction(0.2, on="r")
 
         def force(self, t, q, v):
             y, z = q.x + q.r, q.x + q.r + q.s
@@ -349,10 +305,7 @@ WRONG = [
     ({"q": ("left", "left")}, "`q` of a Wrong must have different names"),
     ({"q": ("left", "v")}, "none of them `v`"),
     ({"contacts": vi.RigidStop(1.0, 0.5, on="left", mass=7.0)}, "whose own masses are used"),
-    (
-        {"contacts": vi.RigidStop(1.0, 0.5, on="up")},
-        "`along` of a contact must be one of the coord",
-    ),
+    ({"contacts": vi.RigidStop(1.0, 0.5, on="up")}, "`along` of a contact must be one of the"),
     ({"contacts": vi.SoftStop(1.0, 9.0, on=("left", "v"))}, "must be one of the coordinates"),
 ]
 
@@ -450,26 +403,19 @@ def test_parameters_may_have_natural_names():
         "phase restitution friction offset stroke torque power clearance clock section parts"
     ).split()
 
-    def force(self, t, q, v):
-        return dict(x=sum(getattr(self, name) for name in names) - 40 * q.x)
-
-    kind = type("Natural", (vi.Mechanical,), {
-        "__annotations__": dict.fromkeys(names, float), "__module__": __name__, "q": ("x",),
-        "cycle": 1.0, "force": force, "contacts": vi.RigidStop(0.1, 0.5, on="x"),
-        **{name: 1.0 for name in names},
-    })  # fmt: skip
-    machine = kind()
-
     class Plain(vi.Mechanical):
-        q = ("x",)
-        mass = 1.0
-        cycle = 1.0
+        q, mass, cycle = ("x",), 1.0, 1.0
         contacts = vi.RigidStop(0.1, 0.5, on="x")
 
         def force(self, t, q, v):
             return dict(x=len(names) - 40 * q.x)
 
-    ends = [vi.simulate(x, x.at(), 1).last for x in (machine, Plain())]
+    force = lambda self, t, q, v: dict(x=sum(getattr(self, n) for n in names) - 40 * q.x)
+    kind = type("Natural", (Plain,), {
+        "__annotations__": dict.fromkeys(names, float), "__module__": __name__, "force": force,
+        **{name: 1.0 for name in names},
+    })  # fmt: skip
+    ends = [vi.simulate(x, x.at(), 1).last for x in (kind(), Plain())]
     np.testing.assert_allclose(ends[0].x, ends[1].x, rtol=1e-13)
     np.testing.assert_allclose(ends[0].v.x, ends[1].v.x, rtol=1e-13)
 

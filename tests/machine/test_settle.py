@@ -1,5 +1,4 @@
-"""Forces, modes and impulses of contacts, as numbers, compared with closed forms (g = 9.81 and unit
-masses) and with the conditions of contact themselves."""
+"""Forces, modes and impulses of contacts fulfil the conditions of contact."""
 
 import itertools
 
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 from vi_jax.machine.settle import Contacts, Strike, settle, strike
 
-g = 9.81
 N, D = 4, 2
 """All questions are padded to four contacts with friction and two dry frictions, in batches of 240,
 so that one program answers them."""
@@ -40,117 +38,6 @@ def each(function, questions):
         result = jax.tree.map(np.asarray, result)
         found += [jax.tree.map(lambda x, i=i, r=result: x[i], result) for i in range(240)]
     return found[:count]
-
-
-def answers(questions):
-    return each(ANSWER, questions)
-
-
-def block(width, height):
-    """Return the inverse masses of (x, y, θ), and the rows of the lower corners."""
-    inverse = np.diag([1, 1, 12 / (width**2 + height**2)])
-    corners = [(-width / 2, -height / 2), (width / 2, -height / 2)]
-    return [[0, 1, x] for x, _ in corners] + [[1, 0, -y] for _, y in corners], inverse
-
-
-def incline(angle, mu):
-    weight = [g * np.sin(angle), -g * np.cos(angle)]
-    return padded([[0, 1], [1, 0]], np.eye(2), weight, [mu])
-
-
-def pushed(width, height, at, force, mu):
-    """A block pushed at a height above the floor."""
-    return padded(*block(width, height), [force, -g, -force * (at - height / 2)], [mu, mu])
-
-
-def drawer(length, width, offset, force, mu):
-    """A drawer pulled beside its middle, which two rails guide without play: four contacts."""
-    places = [(x, y) for x in (-length / 2, length / 2) for y in (-width / 2, width / 2)]
-    rows = [[0, -np.sign(y), -np.sign(y) * x] for x, y in places] + [[1, 0, -y] for _, y in places]
-    inverse = np.diag([1, 1, 12 / (length**2 + width**2)])
-    return padded(rows, inverse, [force, 0, -force * offset], [mu] * 4)
-
-
-def stack(masses, frictions, forces):
-    n, rows = len(masses), np.zeros((2 * len(masses), 2 * len(masses)))
-    for i in range(n):
-        rows[i, n + i] = rows[n + i, i] = 1
-        if i:
-            rows[i, n + i - 1] = rows[n + i, i - 1] = -1
-    force = np.concatenate([forces, -g * np.array(masses)])
-    return padded(rows, np.diag(1 / np.tile(masses, 2)), force, frictions)
-
-
-def rod(angle, mu, slip, speed):
-    """A rod of length 2 whose tip slides on the floor, turning at a speed."""
-    s, c = np.sin(angle), np.cos(angle)
-    asked = padded([[0, 1, -c], [1, 0, s]], np.diag([1, 1, 3]), [0, -g, 0], [mu], slip)
-    asked.rates[[0, N]] += speed**2 * np.array([s, c])
-    return asked
-
-
-MU_P = (1 + 3 * np.cos(1) ** 2) / (3 * np.sin(1) * np.cos(1))
-TIPS = (g / 2 - 0.3 * g / 2) / 0.4
-NEAR = 1e-9
-
-
-def test_known_answers():
-    """Most are closed forms. Forces and rates are compared to 1e-12, thresholds to 1e-9."""
-    halves = [incline(0.4, 0.5), incline(0.5, 0.5), incline(np.arctan(0.5) * (1 - NEAR), 0.5)]
-    found = iter(
-        answers([
-            *halves, incline(np.arctan(0.5) * (1 + NEAR), 0.5),
-            *(pushed(1, 1, 0.9, 0.3 * g * f, 0.3) for f in (1 - NEAR, 1 + NEAR)),
-            *(pushed(1, 1, 0.9, TIPS * f, 0.3) for f in (1 - NEAR, 1 + NEAR)),
-            *(pushed(0.5, 1, 0.8, 3.065625 * f, 0.9) for f in (1 - NEAR, 1 + NEAR, 1.5)),
-            *(drawer(1, 0.4, 0.8, 2, mu) for mu in (0.5, 0.625 * (1 - NEAR), 0.625 * (1 + NEAR))),
-            stack([1, 2, 3], [0.3, 0.4, 0.5], [0, 30, 0]),
-            *(rod(1, MU_P * f, -1, 0) for f in (1 - NEAR, 1 + NEAR)),
-            *(rod(1, 1.6, -1, w) for w in (0, 4)), rod(1, 1.6, 1, 0), rod(1, 0.8, -1, 0),
-        ])
-    )  # fmt: skip
-
-    def normals(x, n=2):
-        return x.force[:n]
-
-    def near(value, expected, size=10):
-        np.testing.assert_allclose(value, expected, rtol=0, atol=1e-12 * size)
-
-    # An incline: sticks up to atan μ.
-    holds, slides, below, above = itertools.islice(found, 4)
-    near([holds.force[N], holds.rate[N]], [-g * np.sin(0.4), 0])
-    near(slides.rate[N], g * (np.sin(0.5) - 0.5 * np.cos(0.5)))
-    assert below.mode[0] == 0 and above.mode[0] == 1
-    # A block pushed at a height of 0.9 slides from μ m g on, and tips while it slides.
-    rests, slips, stands, tips = itertools.islice(found, 4)
-    near(rests.rate, 0)
-    assert (slips.mode[:2] == 1).all()
-    assert stands.force[0] > 0 and tips.force[0] == 0 < tips.rate[0]
-    # One with more friction tips without sliding.
-    stands, begins, tips = itertools.islice(found, 3)
-    assert stands.force[0] > 0 and begins.force[0] == 0 < begins.rate[0]
-    assert not tips.kept[0] and tips.kept[1]
-    near(tips.force[[1, N + 1]], [10.54575, -3.1269375])
-    near(tips.rate[0], 1.4715)
-    assert tips.mode[1] == 0
-    # A drawer jams for μ ≥ L/2e; its forces are not unique, but its acceleration is.
-    runs, hardly, jams = itertools.islice(found, 3)
-    near(runs.rate[N], 0.4)
-    near([hardly.rate[N], jams.rate[N]], [2 * NEAR, 0])
-    assert hardly.mode[:4].any() and (normals(jams, 4) > -1e-15).all() and not jams.unsolved
-    pile = next(found)
-    near(normals(pile, 3), [58.86, 49.05, 29.43])
-    near(pile.force[N : N + 3], [-17.658, -19.62, 6.228])
-    near(pile.rate[N : N + 3], [1.962, 0.114, 0])
-    # Painlevé's rod: no solution beyond μ_P, but the rod lifts off if it turns fast enough.
-    below, beyond, at_rest, turning, back, weak = found
-    assert not below.unsolved and beyond.unsolved and at_rest.unsolved
-    assert not turning.unsolved and not turning.kept[0] and normals(turning, 1) == 0
-    near(turning.rate[0], -g + 16 * np.sin(1))
-    p = 1 + 3 * np.cos(1) ** 2 + 1.6 * 3 * np.sin(1) * np.cos(1)
-    near(back.force[0], g / p)
-    near(weak.force[0], 12.5028225, size=1e5)  # given with nine digits
-    near(weak.force[0] * (p - 7.2 * np.sin(1) * np.cos(1)), g, size=100)
 
 
 def random_question(rng, number):
@@ -221,7 +108,7 @@ def test_random_questions_are_answered(count):
     rng = np.random.default_rng(count)
     questions = [random_question(rng, i) for i in range(count)]
     unsolved = lost = 0
-    for asked, answer in zip(questions, answers(questions), strict=True):
+    for asked, answer in zip(questions, each(ANSWER, questions), strict=True):
         assert not np.isnan(answer.force).any()
         if answer.unsolved:
             assert asked.slip.any()
@@ -232,53 +119,6 @@ def test_random_questions_are_answered(count):
     assert 0 < unsolved < count / 10
     # Lemke's method may end in a ray although a solution exists.
     assert lost <= 0.01 * count
-
-
-def impact(J, inverse, velocity, friction, restitution, struck=(True, True)):
-    J = np.asarray(J, float)
-    gains = J @ inverse @ J.T
-    two = np.ones(2)
-    return Strike(gains, J @ velocity, friction * two, restitution * two, 0 * two, np.array(struck))
-
-
-def test_known_impacts():
-    """Housner's block without restitution, falls on two corners, and Kane's paradox."""
-    slender, flat = block(0.5, 2), block(1, 0.5)
-    falls = [(0, -1, 0), (1, -1, 0)]
-    frictions = (0.0, 1e-12, 0.1)
-    turning = np.array([1, -0.25, -1])  # about the left corner
-    cases = [impact(*slender, turning, mu, 0, (False, True)) for mu in (2, 0.1, 0)]
-    cases += [impact(*flat, np.array(v), mu, 0.5) for v in falls for mu in frictions]
-    # Kane: one contact, and two equal ones that do not act on each other.
-    twice = np.kron(np.array([[1, 0.8], [0.8, 1]]), np.eye(2))
-    kane = Strike(twice, -np.ones(4), 0.3 * np.ones(2), np.ones(2), np.zeros(2), np.ones(2) > 0)
-    cases += [kane._replace(struck=np.array([True, False])), kane]
-    blows = each(BLOWS, cases)
-    assert not any(x.unsolved for x in blows)
-    impulses, shares = [x.impulse for x in blows], [x.share for x in blows]
-
-    def after(i, shape, v):
-        J, inverse = shape
-        return np.array(v) + inverse @ np.array(J).T @ impulses[i]
-
-    # It turns on about the right corner, with this share of the speed if that corner sticks.
-    alpha = np.arctan(0.5 / 2)
-    ratios = [after(i, slender, turning)[2] / turning[2] for i in range(3)]
-    np.testing.assert_allclose(ratios[0], 1 - 1.5 * np.sin(alpha) ** 2, atol=1e-12)
-    np.testing.assert_allclose(ratios[1:], [0.808510638, 0.7], atol=1e-9)
-    for i, (v, mu) in enumerate(itertools.product(falls, frictions), start=3):
-        expected = [v[0] * (1 - 1.5 * mu), 0.5, 0]
-        np.testing.assert_allclose(after(i, flat, v), expected, atol=1e-12)
-    np.testing.assert_allclose(impulses[8][:2], [0.7125, 0.7875], atol=1e-12)
-    assert shares[:9] == [1] * 9
-    # Newton's and Coulomb's laws together would gain energy.
-    theta = 0.801749409
-    np.testing.assert_allclose(shares[9:], theta, atol=1e-9)
-    for i, here in ((9, [0, 2]), (10, [0, 2]), (10, [1, 3])):
-        v = -1 + (twice @ impulses[i])[here]
-        np.testing.assert_allclose(v, [theta, 0.230800893], atol=1e-9)
-        lost = impulses[i][here] @ (v - 1) / 2
-        assert abs(lost) < 1e-14
 
 
 def test_random_impacts_keep_the_conditions():
@@ -345,14 +185,14 @@ def test_a_foot_that_others_hold_is_spare():
 
     def question(places, load):
         rows = [[0, 1, x] for x in places] + [[1, 0, 1]] * len(places)
-        return padded(rows, np.eye(3), [0.5, -g, -g * load + 0.5], [0.9] * len(places))
+        return padded(rows, np.eye(3), [0.5, -9.81, -9.81 * load + 0.5], [0.9] * len(places))
 
     orders = list(itertools.permutations((-0.4, 0.1, 0.4)))
     loads = (-0.2, 0.2, 0.3)
-    found = answers([question(x, load) for x in orders for load in loads])
+    found = each(ANSWER, [question(x, load) for x in orders for load in loads])
     for answer in found:
         assert answer.kept[:3].all() and answer.spare[:3].sum() == 1
         assert (answer.spare[:3] == (answer.force[:3] == 0)).all()
-    over = answers([question(x, 0.6) for x in orders])
+    over = each(ANSWER, [question(x, 0.6) for x in orders])
     for places, answer in zip(orders, over, strict=True):
         assert (answer.kept[:3] == (np.array(places) == 0.4)).all() and not answer.spare.any()

@@ -10,31 +10,6 @@ import pytest
 import vi_jax as vi
 
 
-def speed(machine, s, z):
-    return z.V
-
-
-class Oscillator(vi.AbstractMachine):
-    """x'' = -x - sgn x'."""
-
-    events = vi.Switch(speed, slides=True)
-    cycle = 2 * jnp.pi
-
-    def field(self, s, z, mode):
-        return vi.OscillatorState(z.V, -z.Y - mode)
-
-
-def test_an_oscillator_with_friction_sticks():
-    """From (12, 6) the body turns at √205 - 1, and ends 14 half turns later at 15 - √205."""
-    start = vi.OscillatorState(jnp.array(12.0), jnp.array(6.0))
-    run = vi.simulate(Oscillator(), start, 9, event_log=8)
-    assert bool(run.successful)
-    assert float(run.last.Y) == pytest.approx(15 - np.sqrt(205), abs=1e-8)
-    assert abs(float(run.last.V)) < 1e-12
-    modes = np.asarray(run.event_log.value)[np.asarray(run.event_log.kind) == 3]
-    assert modes[-1] == 0 and (modes[:-1] != 0).all()
-
-
 class Pushed(eqx.Module):
     x: Any
     y: Any

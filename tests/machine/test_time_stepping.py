@@ -129,7 +129,7 @@ def random_blocks(rng, lanes):
 @pytest.mark.slow
 def test_random_blocks_on_a_shaken_floor():
     """Blocks and rods with two corners."""
-    lanes = 60
+    lanes = 30
     given, q, v = random_blocks(np.random.default_rng(1), lanes)
     a, h, mu = given["half_width"], given["half_height"], np.repeat(given["mu"][:, None], 2, 1)
 
@@ -195,7 +195,7 @@ class Stack(vi.Mechanical):
 
 @pytest.mark.slow
 def test_random_stacks_on_a_shaken_floor():
-    lanes, rng = 40, np.random.default_rng(5)
+    lanes, rng = 20, np.random.default_rng(5)
     sizes, phases = shaking(rng, lanes, 8.0, 12.0)
     mass_2, mu = rng.uniform(0.3, 3.0, lanes), rng.uniform(0, 1, (lanes, 2))
     e = rng.choice([0.0, 0.3, 0.7, 1.0], lanes)

@@ -52,11 +52,8 @@ def simulate_impacts(machine, x, v, cycles=1, **options):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("k", "masses", "speeds"),
-    [
-        (0.9, (1.0,) * 5, (1, 0, 0, 0, 0)),
-        (0.6, (1.0, 2.0, 2.0, 1.0), (1, 0, 0, -1)),
-    ],
-)
+    [(0.9, (1.0,) * 5, (1, 0, 0, 0, 0)), (0.6, (1.0, 2.0, 2.0, 1.0), (1, 0, 0, -1))],
+)  # fmt: skip
 def test_newtons_cradle(k, masses, speeds):
     """One ball hits touching balls: of five with k = .9 the first keeps .0435250820. Two balls hit
     a touching pair from both sides: impacts coupled by other contacts are resolved together."""

@@ -12,48 +12,13 @@ from scipy.integrate import solve_ivp
 from chain import Chain, row
 
 
-class Stack(Chain):
-    """Two equal bodies: a against b, and b against a wall at y = 0."""
+class Thrown(Chain):
+    """A body a against b, and b against a wall at y = 0, with the same acceleration off it."""
 
     restitution: Any = 0.3
-    weights: tuple[float, ...] = (1.0, 1.0)
+    weights: tuple[float, ...] = (2.0, 1.0)
     wall: float | None = 0.0
     length: Any = 2 * np.pi
-    forces: Any = None
-    """Constant forces on both bodies, and the amplitude of a force cos s on the first."""
-
-    def force(self, t, q, v):
-        first, second, turning = self.forces
-        return dict(a=first + turning * jnp.cos(t) - 0.1 * v.a, b=second - 0.1 * v.b)
-
-
-@pytest.mark.slow
-def test_a_stack_pressed_on_a_wall_stays_there():
-    """Both bodies or one of them are pressed. The outer body leaves when its own force turns."""
-
-    def run(forces):
-        stack = Stack(forces=forces)
-        return vi.simulate(stack, stack.start(), 1, event_log=6)
-
-    runs = jax.vmap(run)(jnp.array([(1.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.5, 0.2, 1.0)]))
-    assert bool(runs.successful.all())
-    for numbers in jax.tree.leaves(runs.last):
-        np.testing.assert_allclose(numbers[:2], 0.0, atol=1e-14)
-    leaves = runs.event_log.phase[2][runs.event_log.kind[2] == 2]
-    np.testing.assert_allclose(leaves, [2 * np.pi / 3], atol=1e-9)
-    np.testing.assert_allclose(runs.last.b[2], 0.0, atol=1e-14)
-
-    def free(s, z):
-        return z[1], 0.5 + np.cos(s) - 0.1 * z[1]
-
-    there = solve_ivp(free, (2 * np.pi / 3, 2 * np.pi), (0, 0), rtol=1e-11, atol=1e-13).y[:, -1]
-    np.testing.assert_allclose([runs.last.a[2], runs.last.v.a[2]], there, atol=1e-8)
-
-
-class Thrown(Stack):
-    """A stack with a heavier first body. Both bodies have the same acceleration off the wall."""
-
-    weights: tuple[float, ...] = (2.0, 1.0)
 
     def force(self, t, q, v):
         pull = 1 + 2 * jnp.cos(t)

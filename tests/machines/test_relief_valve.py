@@ -1,13 +1,10 @@
 """The relief valve, a machine whose cycles end with an event."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-
-from differences import check_derivatives
 
 VALVE = vi.machines.ReliefValve
 CLOSE = vi.Adaptive(rtol=1e-12)
@@ -74,15 +71,3 @@ def test_a_valve_observed_at_equal_times():
         valve.observed_every(0.0)
     with pytest.raises(ValueError, match="driven"):
         vi.machines.Duffing().observed_every(1.0)
-
-
-@pytest.mark.slow
-def test_derivatives_of_returns():
-    """Derivatives at a fixed number of returns include dt*/dq."""
-
-    def last(q):
-        valve = eqx.tree_at(lambda m: m.flow_rate, VALVE(), q[0])
-        run = vi.simulate(valve, valve.start(), 2, method=vi.FixedStep())
-        return (run.last.lift, run.last.pressure, run.duration.sum()), run.impacts
-
-    check_derivatives(last, [4.0], step=1e-6, impacts=0)

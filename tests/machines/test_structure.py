@@ -173,10 +173,7 @@ EYE = np.eye(2)
 WRONG = {
     "mass that is not square": ({"mass": np.ones((2, 3))}, r"`mass`.*\(2, 3\)"),
     "mass that is not definite": ({"mass": np.diag([1.0, 0.0])}, "positive definite.* 0,"),
-    "mass that is not symmetric": (
-        {"mass": [[2.0, 1.0], [0.0, 2.0]]},
-        r"`mass`.*symmetric.*\[0, 1",
-    ),
+    "mass that is not symmetric": ({"mass": [[2.0, 1.0], [0.0, 2.0]]}, r"`mass`.*symmetric.*\[0, "),
     "stiffness of another size": ({"stiffness": np.eye(3)}, r"`stiffness`.*\(3, 3\)"),
     "row of another length": ({"contacts": (vi.RigidStop(1, 1, at=[1.0]),)}, r"contacts\[0\].at"),
     "no row": ({"contacts": (vi.RigidStop(1, 1),)}, r"Stop 0 .*at=c"),

@@ -1,4 +1,4 @@
-"""The unbalanced motor, compared with its averaged response and with its angle as the clock."""
+"""The unbalanced motor, compared with its angle as the clock."""
 
 from typing import ClassVar
 
@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+
+pytestmark = pytest.mark.slow
 
 ROTOR = vi.machines.UnbalancedRotor
 
@@ -54,36 +56,6 @@ def find_both_orbits(rotor, cycles=400):
     return vi.find_orbit(rotor, settled), vi.find_orbit(other, other.convert_start(settled))
 
 
-@pytest.mark.slow
-def test_sommerfeld_response_converges_to_the_averaged_one():
-    """ε and the motor's strength fall together, which leaves the averaged response unchanged."""
-    couplings = np.array([0.005, 0.0025, 0.00125, 0.000625])
-    zetas = np.array([0.85, 0.98, 1.15])  # below, near and beyond the peak
-    reach = zetas**2 / (1 - zetas**2 + 0.1j * zetas)
-    rotor = ROTOR(strength=0.2, coupling=0.02)
-    load = rotor.coupling * rotor.damping_ratio * zetas * np.abs(reach) ** 2
-    kappas = zetas / rotor.no_load_speed + load / rotor.strength
-
-    def error(coupling, kappa, zeta, real, imaginary):
-        weak = ROTOR(strength=10 * coupling, control=kappa, coupling=coupling)
-        orbit = vi.find_orbit(weak, weak.start(Y=real, V=-zeta * imaginary, W=zeta))
-        return (
-            orbit.frequency_ratio - zeta,
-            orbit.y_max - jnp.hypot(real, imaginary),
-            orbit.successful,
-        )
-
-    rows = [np.repeat(x, 4) for x in (kappas, zetas, reach.real, reach.imag)]
-    found = jax.vmap(error)(np.tile(couplings, 3), *rows)
-    speed, amplitude, good = (np.asarray(x).reshape(3, 4) for x in found)
-    assert good.all()
-    orders, _ = np.polyfit(np.log(couplings), np.log(np.abs(speed)).T, 1)
-    np.testing.assert_allclose(orders, 1.0, atol=0.1)
-    assert (np.abs(speed[:, -1]) < 1e-4).all()
-    assert (np.abs(amplitude[:, -1]) < 1e-3 * np.abs(reach)).all()
-
-
-@pytest.mark.slow
 def test_random_motors_equal_those_with_their_angle_as_the_clock():
     draw = np.random.default_rng(5).uniform
     ranges = {"strength": (0.05, 1), "control": (0.6, 1.8), "no_load_speed": (0.8, 1.2),
@@ -110,7 +82,6 @@ def test_random_motors_equal_those_with_their_angle_as_the_clock():
     assert int(one.impacts.sum()) > 24
 
 
-@pytest.mark.slow
 def test_a_start_from_rest_passes_the_resonance_and_a_stalled_motor_ends_no_cycle():
     rotor = ROTOR(control=1.2, strength=0.3)
     run = vi.simulate(rotor, rotor.start(W=0.0), 60)
@@ -120,7 +91,6 @@ def test_a_start_from_rest_passes_the_resonance_and_a_stalled_motor_ends_no_cycl
     assert bool(stalled.result == vi.RESULTS.max_steps)
 
 
-@pytest.mark.slow
 def test_branches_pass_the_begin_of_a_cycle():
     """An impact passes the section without effect. Symmetry breaks at one gap in both clocks."""
     rotor, bounds = ROTOR(gap=1.0, two_sided=True), (0.7, 1.4)

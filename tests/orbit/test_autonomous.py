@@ -11,6 +11,8 @@ from belts import Belt
 from resets import legs
 from rimless_wheel import MULTIPLIER, Wheel
 
+pytestmark = pytest.mark.slow
+
 
 class Walker(resets.Walker):
     """The walker of `resets`, with its heel strike at a section instead of a reset."""
@@ -42,7 +44,6 @@ def step_by_scipy(slope, stance, turning):
     return np.array([-x[0], x[1] * np.cos(2 * x[0])])
 
 
-@pytest.mark.slow
 def test_period_doubling_of_a_walker():
     """Each cycle begins with a jump of the first coordinate."""
     orbit = vi.find_orbit(Walker(0.009), legs(0.2003, -0.1998))
@@ -68,7 +69,6 @@ class BeltAtGreatestPosition(Belt):
     cycle = vi.falling("V", usual=2 * np.pi)
 
 
-@pytest.mark.slow
 def test_stick_slip_branches_end_at_grazing_sliding():
     """Branches of motions that stick and of motions that only slide end at the same point. The
     sliding ones begin at a Hopf point: the friction 0.5 + 0.5 exp(-2v) of a body at rest has the
@@ -91,7 +91,6 @@ def test_stick_slip_branches_end_at_grazing_sliding():
     assert abs(hopf.orbit.multipliers[0]) == pytest.approx(1, abs=1e-6)
 
 
-@pytest.mark.slow
 def test_a_branch_ends_near_a_homoclinic_motion():
     """On gentler slopes a rimless wheel slows down ever more as it passes its upright rest."""
     wheel = Wheel()

@@ -85,12 +85,8 @@ def check_equation_21(branch, restitution, near):
 
 
 def test_the_2pi_branch_is_the_closed_form(short):
-    assert sorted(p.kind for p in short.special) == [
-        "fold",
-        "grazing",
-        "grazing",
-        "period-doubling",
-    ]
+    kinds = ["fold", "grazing", "grazing", "period-doubling"]
+    assert sorted(p.kind for p in short.special) == kinds
     check_closed_forms(short, 0.5)
     check_equation_21(short, 0.5, 1.5)
 
@@ -105,9 +101,8 @@ def test_branches_of_4pi(family):
     assert "period-doubling" in doubled.ends
     springs = next(p for p in doubled.special if "begins at" in p.detail)
     at = first_of(single, "period-doubling").parameter
-    assert "right stop at crank angle φ = " in str(springs.orbit) and " rad, V⁻" in str(
-        springs.orbit
-    )
+    for words in ("right stop at crank angle φ = ", " rad, V⁻"):
+        assert words in str(springs.orbit)
     assert springs.kind == "period-doubling" and springs.parameter == pytest.approx(at, abs=1e-11)
     assert float(springs.orbit.residual) < 1e-12
     # The 4π motion with one impact begins where the doubled motion loses an impact.
@@ -127,19 +122,6 @@ def test_branches_of_4pi(family):
     matched = re.search(r"the impact at crank angle φ = ([0-9.]+) of 4π is lost", str(lost))
     assert matched is not None
     assert float(matched[1]) == pytest.approx(float(lost.orbit.impact_phase[slowest]), abs=1e-4)
-
-
-@pytest.mark.slow
-def test_special_points_do_not_depend_on_the_step(family):
-    doubled = family[1]
-    for max_step in (0.015, 0.2):
-        again = vi.continue_orbit(
-            doubled.orbit(1), parameter=ZETA, bounds=(0.5, 1.9), max_step=max_step
-        )
-        kinds = sorted(p.kind for p in again.special)
-        assert kinds == ["fold", "grazing", "period-doubling"]
-        for mine in again.special:
-            assert mine.parameter == pytest.approx(first_of(doubled, mine.kind).parameter, abs=1e-8)
 
 
 @pytest.mark.slow
@@ -262,10 +244,7 @@ def test_a_restored_branch_can_be_switched(short):
     [
         ({"parameter": "drive.frequency"}, "near names: drive.frequency_ratio"),
         ({"bounds": (1.0, 1.2)}, "`bounds` must hold the orbit's drive.frequency_ratio = 0.9"),
-        (
-            {"bounds": (-1.0, 1.2)},
-            "`bounds` must leave the machine valid, but at .* = -1: Argument",
-        ),
+        ({"bounds": (-1.0, 1.2)}, "`bounds` must leave the machine valid, but at .* = -1:"),
     ],
 )
 def test_invalid_arguments_raise(short, arguments, message):

@@ -7,10 +7,11 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from vi_jax.orbit import from_orbit
 
+pytestmark = pytest.mark.slow
+
 ZETA = "drive.frequency_ratio"
 
 
-@pytest.mark.slow
 def test_grazing_of_the_classic_impact_oscillator():
     """The motion without impacts has amplitude 1/√((1 - ζ²)² + (2ξζ)²). It grazes where this
     equals the gap (Shaw and Holmes 1983; Nordmark 1991)."""
@@ -34,14 +35,8 @@ def test_grazing_of_the_classic_impact_oscillator():
     )  # fmt: skip
     closed = vi.closed_form_orbits(there)
     assert np.nanmin(np.abs(closed.impact_speed - gained.impact_speed[0])) < 1e-9
-    # In ζ and d the curve of grazings is the resonance curve.
-    curve = vi.boundary(grazing, parameter="stops.0.gap", bounds=((0.3, 0.95), (1.1, 3.0)))
-    zeta, d = curve.parameters.T
-    np.testing.assert_allclose(1 / np.hypot(1 - zeta**2, 2 * xi * zeta), d, rtol=1e-9)
-    assert np.ptp(d) > 1
 
 
-@pytest.mark.slow
 def test_the_only_special_point_without_damping_is_a_touch_on_the_section():
     """The body turns on the section, where its velocity is rounding, and its multipliers have
     modulus 1 to rounding. Neither may displace the grazing, A = 1/(1 - ζ²) = 2 at ζ = √½."""
@@ -54,7 +49,6 @@ def test_the_only_special_point_without_damping_is_a_touch_on_the_section():
         assert point.parameter == pytest.approx(np.sqrt(0.5), abs=1e-12)
 
 
-@pytest.mark.slow
 def test_a_weak_motor_whose_crank_slows_down_within_a_turn(monkeypatch):
     """Steps chosen for the crank's speed on the section are too few: they gave false branch points
     and a false torus. Compare the grazing and the fold with SciPy, which integrates in time. A
@@ -100,7 +94,6 @@ def test_a_weak_motor_whose_crank_slows_down_within_a_turn(monkeypatch):
         vi.continue_orbit(orbit, parameter="drive.control", bounds=(0.5, 1.2), max_points=3)
 
 
-@pytest.mark.slow
 def test_a_period_doubling_right_before_an_impact_is_lost():
     """In the closed form one multiplier passes -1 near the grazing, and tends to -∞ there. A step
     that spans both detects the doubling only by the side from which it reaches the grazing."""
@@ -115,9 +108,8 @@ def test_a_period_doubling_right_before_an_impact_is_lost():
     exact = vi.closed_form_orbits(scene_at(0.5))
     orbit = vi.find_orbit(scene_at(0.5), scene_at(0.5).start(Y=exact.Y[0], V=exact.V[0]))
     for step, max_step in ((0.01, 0.05), (0.5, 0.5)):
-        branch = vi.continue_orbit(
-            orbit, parameter=ZETA, bounds=(0.3, 0.6), step=step, max_step=max_step
-        )
+        steps = {"step": step, "max_step": max_step}
+        branch = vi.continue_orbit(orbit, parameter=ZETA, bounds=(0.3, 0.6), **steps)
         grazing, doubling = branch.special
         assert (grazing.kind, doubling.kind) == ("grazing", "period-doubling")
         assert doubling.parameter == pytest.approx(wanted, abs=1e-10)

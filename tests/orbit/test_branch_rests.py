@@ -40,20 +40,11 @@ def branch(orbit):
 
 
 @pytest.mark.slow
-def test_an_orbit_reports_rests(orbit):
-    assert int(orbit.rests) == 1 and "impacts and 1 rest on a stop, stable" in str(orbit)
-    pressed = scene_at(0.7, gap=-3.0)
-    held = vi.find_orbit(pressed, pressed.start(Y=-3.0), impact_log=32)
-    assert int(held.rests) == 0 and "0 impacts and rest on a stop, stable" in str(held)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("q", [("y", "x"), ("x", "y")])
 def test_rests_with_another_body_in_motion(q):
     """Newton's method leaves the resting body a velocity of 1e-28, which is no impact."""
-    base = dict(
-        q=q, mass=(1.0, 1.0), cycle=2 * np.pi, contacts=vi.RigidStop(0, 0.5, "left", on="y")
-    )
+    stop = vi.RigidStop(0, 0.5, "left", on="y")
+    base = dict(q=q, mass=(1.0, 1.0), cycle=2 * np.pi, contacts=stop)
     force = lambda _, t, q, v: {"y": -1 + 1.5 * jnp.sin(t), "x": jnp.cos(t) - 0.3 * (q.x + v.x)}
     machine = type("Beside", (vi.Mechanical,), base | {"force": force})()
     last = vi.simulate(machine, machine.at(y=0.2), 1, settle=60).last
@@ -97,6 +88,9 @@ def test_motions_of_the_branch_are_flights_from_release(branch):
 
 @pytest.mark.slow
 def test_a_branch_reports_rests(branch):
+    pressed = scene_at(0.7, gap=-3.0)
+    held = vi.find_orbit(pressed, pressed.start(Y=-3.0), impact_log=32)
+    assert int(held.rests) == 0 and "0 impacts and rest on a stop, stable" in str(held)
     point = branch.orbit(0)
     again = vi.find_orbit(point.machine, point, impact_log=32, throw=True)
     for motion in (point, again):

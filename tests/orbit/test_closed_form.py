@@ -31,10 +31,8 @@ def samples(seed, count=400):
     """Draw ζ, ξ, k, d at random, half of them undamped and some overdamped."""
     draw = np.random.default_rng(seed)
     zeta, k, d = (
-        draw.uniform(0.4, 2.5, count),
-        draw.uniform(0.05, 1, count),
-        draw.uniform(0, 3, count),
-    )
+        draw.uniform(0.4, 2.5, count), draw.uniform(0.05, 1, count), draw.uniform(0, 3, count),
+    )  # fmt: skip
     xi = np.where(draw.random(count) < 0.5, 0.0, 10 ** draw.uniform(-3, 0.3, count))
     apart = np.abs(1 - zeta**2 + 2j * xi * zeta) > 0.02  # `flight` loses digits near resonance
     return zeta[apart], xi[apart], k[apart], d[apart]

@@ -45,11 +45,8 @@ def falling(approach):
 
 @pytest.mark.slow
 def test_exact_flight_is_used_only_where_it_applies():
-    """Another crank or field raises. Flights with another restitution agree with adaptive steps."""
-    for other in (scene_of(crank=Doubled()), scene_of(Hardening)):
-        with pytest.raises(ValueError, match=r"`ExactFlight` needs a .*(Doubled|Hardening)"):
-            vi.simulate(other, other.start(), 8, method=vi.ExactFlight())
-        assert isinstance(vi.preset(other), vi.FixedStep)
+    """Flights with another law of restitution agree with adaptive steps. Other equations raise
+    (`flow/test_changed_parts.py`)."""
     law = scene_of(stop=vi.RigidStop(1.5, falling))
     exact, stepped = (
         vi.simulate(law, law.start(), 8, method=method, record="sections")

@@ -92,9 +92,8 @@ def test_folds_meet_doublings():
     a, b = other.parameters.T
     np.testing.assert_allclose(a, -((0.3 - b) ** 2), atol=1e-10)
     np.testing.assert_allclose(only(other, "fold-flip").parameters, [0.0, 0.3], atol=1e-9)
-    back = vi.boundary(
-        only(other, "fold-flip").switch(), parameter="b", bounds=((-1.0, 1.0), (-1.0, 1.0))
-    )
+    again = only(other, "fold-flip").switch()
+    back = vi.boundary(again, parameter="b", bounds=((-1.0, 1.0), (-1.0, 1.0)))
     assert back.kind == "fold"
     np.testing.assert_allclose(back.parameters[:, 0], 0, atol=1e-9)
 

@@ -55,11 +55,6 @@ def test_more_nodes_are_more_accurate():
     assert errors[2] < 1e-6 < errors[1] < 2e-5 < errors[0]
 
 
-def test_chain_of_nodes():
-    run = vi.simulate(vi.delay_chain(Struck(), 16), cycles=5)
-    np.testing.assert_allclose(run.last.x, -0.3721662410390, rtol=0, atol=2e-5)
-
-
 @pytest.mark.slow
 def test_boundary_in_two_parameters():
     orbit = vi.find_orbit(vi.delay_chain(Fed(gain=0.2, delay=3.06), 10))

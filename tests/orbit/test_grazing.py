@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -11,6 +12,8 @@ from vi_jax.orbit.forecast import find_attractors
 from vi_jax.orbit.local_map import graze_at
 
 from grazings import grazing_of
+
+pytestmark = pytest.mark.slow
 
 K = 0.8
 
@@ -34,7 +37,6 @@ def half():
     return point, vi.grazing(point), frequency, amplitude
 
 
-@pytest.mark.slow
 def test_local_map_agrees_with_the_closed_form(half):
     _, found, frequency, amplitude = half
     assert found.value == pytest.approx(amplitude, rel=1e-12)
@@ -51,7 +53,6 @@ def test_local_map_agrees_with_the_closed_form(half):
     np.testing.assert_allclose(found.entries, e, atol=1e-13)
 
 
-@pytest.mark.slow
 def test_periods_after_a_grazing(half):
     """Windows of motions with one impact have chaos between them (`scans/test_regimes.py`; Chin,
     Ott, Nusse and Grebogi, Phys. Rev. E 50, 1994)."""
@@ -78,7 +79,6 @@ def fly(field, hit, s0, s1, x):
         s0, x = run.t[-1], hit[1](run.y[:, -1])
 
 
-@pytest.mark.slow
 def test_error_of_the_discontinuity_mapping():
     """An impact changes the state at order y; the mapping has an error of order y²."""
     machine = vi.machines.Duffing(
@@ -111,16 +111,14 @@ def test_error_of_the_discontinuity_mapping():
     np.testing.assert_allclose(slopes, 2, atol=0.1)
 
 
-@pytest.mark.slow
 def test_grazing_of_the_paper():
     """The 2π motion of the paper is lost at BB'. Since e₁ > 0 > e₂, an impact brings the body
     nearer to the stop two periods later, and there is no attractor near."""
     restitution, damping, zeta = 0.5, 0.04483682577, 0.70998
     scene = vi.Scene.ideal(frequency_ratio=0.8, restitution=restitution, damping_ratio=damping)
     closed = vi.closed_form_orbits(scene)
-    point = grazing_of(
-        scene, "drive.frequency_ratio", (0.5, 1.9), scene.start(Y=closed.Y[0], V=closed.V[0])
-    )
+    start = scene.start(Y=closed.Y[0], V=closed.V[0])
+    point = grazing_of(scene, "drive.frequency_ratio", (0.5, 1.9), start)
     found = vi.grazing(point)
     assert found.value == pytest.approx(zeta, abs=1e-5) and found.side == 1
     rate, turn = np.sqrt(1 - damping**2), 2 * np.pi / found.value
@@ -138,7 +136,6 @@ def test_grazing_of_the_paper():
     assert [text.get_text() for text in ax.texts] == ["forecast: no attractor near"]
 
 
-@pytest.mark.slow
 def test_two_stops_are_touched_at_once():
     """A symmetric motion grazes both stops, half a period apart."""
     machine = vi.machines.Duffing(amplitude=0.3, frequency=0.7, damping=0.4, gap=1.0)
@@ -147,3 +144,58 @@ def test_two_stops_are_touched_at_once():
     field = np.array([[0.0, 1.0], [-1.0, -0.4]])
     np.testing.assert_allclose(found.matrix, expm(field * 2 * np.pi / 0.7), atol=1e-10)
     assert found.checked is not None and found.windows is None
+
+
+class Soft(vi.Mechanical):
+    """A driven body with a soft stop."""
+
+    q, mass, cycle = ("x",), (1.0,), 2 * jnp.pi
+    stop: vi.SoftStop
+    push: float = 1.0
+
+    @property
+    def contacts(self):
+        return self.stop
+
+    def force(self, t, q, v):
+        return dict(x=self.push * jnp.cos(t) - 0.5 * q.x - 0.4 * v.x)
+
+
+SWING = 1 / np.hypot(0.5, 0.4)
+
+
+def soft_grazing(stiffness=30.0, **options):
+    machine = Soft(vi.SoftStop(1.1 * SWING, stiffness, **options))
+    return grazing_of(machine, "stop.gap", (0.9 * SWING, 1.2 * SWING))
+
+
+def test_orders_and_kicks_of_soft_stops():
+    """Over a parabola of depth, a spring of stiffness K gives the impulse K (4/3) √(2/a) y³. At a
+    prestress F0 the field jumps, and the body turns back with the acceleration a + F0. A dashpot
+    that cannot pull gives an impulse of order y². A contact that is less deep than rounding is
+    refused: regression, 5 % off at 1e9, and a damped one of another order."""
+    for stiffness in (1e9, 1e8, 30.0):
+        found = vi.grazing(soft_grazing(stiffness), check=False)
+        assert found.order[0] == 1.5 and found.rate[0] == pytest.approx(SWING, rel=1e-9)
+        impulse = -stiffness * 4 / 3 * np.sqrt(2 / SWING)
+        np.testing.assert_allclose(found.kick[0], [0, impulse], rtol=2e-3, atol=2e-3 * -impulse)
+    assert found.outcome == vi.SCENARIOS.persistence
+    for stiffness, damping in ((1e10, 0.0), (1e9, 0.6)):
+        with pytest.raises(ValueError, match=r"a stop that is less stiff: .* Take a `RigidStop`"):
+            vi.grazing(soft_grazing(stiffness, damping=damping), check=False)
+    found = vi.grazing(soft_grazing(prestress=2.0))
+    assert found.order[0] == 0.5
+    kick = -2 * 2.0 * np.sqrt(2 * SWING) / (SWING + 2.0)
+    np.testing.assert_allclose(found.kick[0], [0, kick], rtol=1e-8, atol=1e-12)
+    assert found.checked is not None and found.agreement > 0.9
+    assert graze_at(soft_grazing(restitution=0.6, adhesive=False)).touches[0].kick.order == 1
+
+
+def test_grazings_from_the_side_of_contact():
+    """Touch and release vanish together. Compare the push with that of the linear oscillator."""
+    machine, bounds = Soft(vi.SoftStop(1.0, 20.0, restitution=0.8), 0.9), ((0.2, 1.0), (0.5, 1.5))
+    start = vi.simulate(machine, machine.start(), 1, settle=200).last
+    point = grazing_of(machine, "push", bounds[0], start)
+    curve = vi.boundary(point, parameter="stop.gap", bounds=bounds)
+    assert point.impact is not None and curve.ends == ("bounds", "bounds")
+    np.testing.assert_allclose(*(curve.parameters / [1.0, SWING]).T, rtol=1e-12)

@@ -128,9 +128,8 @@ def test_special_points_with_a_fixed_quantity(struck):
     # After a switch the gap is an ordinary parameter.
     doubled = doubling.switch()
     assert int(doubled.cycles) == 2 and float(doubled.machine.stops[0].gap) == gap
-    curve = vi.boundary(
-        doubling, parameter="stops.0.restitution", bounds=((0.9, 1.05), (0.45, 0.55))
-    )
+    bounds = (0.9, 1.05), (0.45, 0.55)
+    curve = vi.boundary(doubling, parameter="stops.0.restitution", bounds=bounds)
     assert np.abs(curve.multipliers + 1).min(axis=1).max() < 1e-8
 
 

@@ -33,9 +33,8 @@ def test_power_balance_of_an_orbit(orbit):
     assert f"mean taken: {float(orbit.averages['taken']):.9g} W" in repr(orbit)
     data = orbit.to_xarray()
     assert data.taken.attrs["units"] == "W" and data.section_energy.dims == ("section",)
-    np.testing.assert_allclose(
-        orbit.quantities["energy"], 0.5 * (orbit.sections.V**2 + orbit.sections.Y**2)
-    )
+    energy = 0.5 * (orbit.sections.V**2 + orbit.sections.Y**2)
+    np.testing.assert_allclose(orbit.quantities["energy"], energy)
 
 
 @pytest.mark.slow
@@ -45,9 +44,7 @@ def test_quantities_along_a_branch(branch, orbit):
     np.testing.assert_allclose(here.averages["taken"], orbit.averages["taken"], atol=1e-8)
     orbits = [branch.orbit(i) for i in range(len(branch.parameter))]
     np.testing.assert_allclose([missing(at.averages, at) for at in orbits], 0.0, atol=1e-9)
-    np.testing.assert_allclose(
-        branch.column("section_Y"), [at.state.Y for at in orbits], atol=1e-14
-    )
+    np.testing.assert_allclose(branch.column("section_Y"), [x.state.Y for x in orbits], atol=1e-14)
     np.testing.assert_allclose(branch.column("duration"), 2 * np.pi / branch.parameter)
     assert (branch.column("impacts") == branch.impact_speed.shape[1]).all()
     data = branch.to_xarray(along="point")

@@ -15,6 +15,8 @@ from scipy.integrate import solve_ivp
 
 from kicked import Kicked, at
 
+pytestmark = pytest.mark.slow
+
 
 class Twins(vi.AbstractMachine):
     """Two oscillators Y'' + 0.15 Y' - Y + Y³ = f cos ωs, coupled by κ (Y2 - Y1)."""
@@ -78,7 +80,6 @@ def monodromy(point):
     return end[4:].reshape(4, 4)
 
 
-@pytest.mark.slow
 def test_each_bifurcation_of_two_oscillators_is_found():
     """Two multipliers of uncoupled, weakly coupled or slightly different oscillators pass 1 or -1
     within one step, so that no determinant changes its sign."""
@@ -101,7 +102,6 @@ def test_each_bifurcation_of_two_oscillators_is_found():
             assert np.abs(values + off).min() < 1e-6, (point, values)
 
 
-@pytest.mark.slow
 def test_a_branch_that_leaves_another_to_both_sides():
     """The branch of unequal motions turns back in its parameter where it meets that of equal ones.
     This is a branch point, not a fold, and a switch leads to the other branch."""
@@ -134,7 +134,6 @@ def test_curves_of_branch_points():
         vi.boundary(point, parameter="excess", bounds=((0.02, 0.25), (-0.1, 0.1)))
 
 
-@pytest.mark.slow
 def test_a_branch_that_begins_at_a_grazing_goes_to_one_side():
     """The gap at the grazing is the amplitude of the linear motion."""
     zeta, xi = 0.31, 0.25
@@ -149,7 +148,6 @@ def test_a_branch_that_begins_at_a_grazing_goes_to_one_side():
     assert again.parameter.min() == pytest.approx(grazes, abs=1e-10)
 
 
-@pytest.mark.slow
 def test_watch_locates_the_zero_of_a_function():
     """Locate the point at which the greatest position is 1.3."""
     scene = vi.Scene.ideal(frequency_ratio=0.31, restitution=0.76, gap=9.0, damping_ratio=0.25)
@@ -178,7 +176,6 @@ class Turning(Kicked):
         return x + 0.3 * x * (self.a - (x - self.b) ** 2), 0.3 * y
 
 
-@pytest.mark.slow
 def test_a_fold_and_a_branch_point_in_one_step():
     """Regression: a single branch point was reported, at the fold. A branch that begins at the fold
     also has the branch point."""
@@ -192,7 +189,6 @@ def test_a_fold_and_a_branch_point_in_one_step():
     assert [point.kind for point in begun.special] == ["branch-point"]
 
 
-@pytest.mark.slow
 def test_a_curve_of_touches_ends_where_the_other_stop_is_touched():
     """The amplitude of the linear oscillator equals the other gap at the end."""
     stops = vi.RigidStop(9.0, 0.5), vi.RigidStop(10.0, 0.5, "left")

@@ -146,9 +146,8 @@ def test_grazing_sliding_of_a_motion_that_sticks():
     speed. Compare with shooting by SciPy."""
     machine = Damped()
     stuck = vi.simulate(machine, machine.start(V=1.5), 1, settle=40).last
-    branch = vi.continue_orbit(
-        vi.find_orbit(machine, stuck, throw=True), parameter="speed", bounds=(1.3, 1.9)
-    )
+    orbit = vi.find_orbit(machine, stuck, throw=True)
+    branch = vi.continue_orbit(orbit, parameter="speed", bounds=(1.3, 1.9))
     point = branch.special[-1]
     assert point.kind == "grazing-sliding" and "no longer" in point.detail
     curve = vi.boundary(point, parameter="damping", bounds=((0.5, 3.5), (0.05, 0.3)))

@@ -155,9 +155,8 @@ SNAP = M.Duffing(
 def test_a_motion_without_impacts_loses_its_symmetry():
     """Near a branch point the equations may have no solution, or that of the other branch."""
     orbit = vi.find_orbit(SNAP, SNAP.start(Y=-0.305011053, V=0.0199429225), throw=True)
+    options = {"parameter": "amplitude", "bounds": (0.05, 2.0)}
     for max_step in (0.05, 0.15):
-        branch = vi.continue_orbit(
-            orbit, parameter="amplitude", bounds=(0.05, 2.0), max_step=max_step
-        )
+        branch = vi.continue_orbit(orbit, **options, max_step=max_step)
         assert kinds(branch) == ["symmetry-breaking", "fold", "grazing"]
         assert branch.special[0].parameter == pytest.approx(1.752976613, abs=2e-8)

@@ -73,15 +73,6 @@ def torus_at(machine, start, cycles=1):
 
 
 @pytest.mark.slow
-def test_a_torus_from_a_neimark_sacker_point():
-    torus = torus_at(Ring(0.21, -0.05), at(0.01, 0.01))
-    b = float(torus.machine.b)
-    assert b > 0 and torus.successful, torus
-    assert torus.rotation == pytest.approx(rotation_of(0.21, b), abs=1e-12)
-    np.testing.assert_allclose(torus.exponents, [0, np.log(1 - 2 * b)], atol=1e-9)
-
-
-@pytest.mark.slow
 def test_an_unstable_torus():
     torus = torus_at(Repelling(0.21, 0.05), at(0.01, 0.01))
     family = vi.continue_torus(torus, parameter="b", bounds=(0.001, 0.2))

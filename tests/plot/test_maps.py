@@ -105,9 +105,7 @@ def test_outcomes_have_colours():
 def _basins(label, dims, **coords):
     motions = [
         vi.Attractor(0, 1, 1.0, {"Y": np.array([0.2]), "V": np.array([1.0])}, 4, 0.5, 0.1),
-        vi.Attractor(
-            1, 2, 3.0, {"Y": np.array([0.0, 9.0]), "V": np.array([0.0, 9.0])}, 2, 0.2, 0.1
-        ),
+        vi.Attractor(1, 2, 3.0, dict.fromkeys("YV", np.array([0.0, 9.0])), 2, 0.2, 0.1),
     ]
     label = np.asarray(label, np.int8)
     data = xr.Dataset({"label": (dims, label), "result": (dims, 0 * label)}, coords=coords)

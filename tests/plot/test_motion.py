@@ -1,14 +1,18 @@
-"""Pictures of motions agree with the simulation: points, impacts, stops, units, and styles."""
+"""Pictures of motions agree with the simulation, and every kind of special point can be drawn."""
+
+from types import SimpleNamespace
 
 import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import vi_jax as vi
 from matplotlib.figure import Figure
+from vi_jax.orbit import KINDS
+from vi_jax.orbit.kinds import FOLLOWED
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
 from vi_jax.plot import motion_path, plot_history
 
 
@@ -48,10 +52,8 @@ def test_path_holds_the_samples_and_the_impacts(scene, run):
 
 def test_stop_on_the_left():
     left = vi.Scene(
-        damping_ratio=0.01,
-        drive=vi.IdealDrive(0.9),
-        stops=(vi.RigidStop(1.0, 0.7, side="left"),),
-    )
+        damping_ratio=0.01, drive=vi.IdealDrive(0.9), stops=(vi.RigidStop(1.0, 0.7, side="left"),),
+    )  # fmt: skip
     run = vi.simulate(left, left.start(), 6, samples=32, impact_log=4)
     path = motion_path(run, machine=left)
     at = np.flatnonzero(path.Y == -1.0)
@@ -96,3 +98,26 @@ def test_sizes_of_figure_words_and_lines(run, name, width, points, line):
     assert ratio == pytest.approx(line / 1.5)
     plt.close(plain.figure)
     plt.close(ax.figure)
+
+
+SCENE = vi.Scene.ideal(frequency_ratio=0.9)
+
+
+class Drawn(vi.Boundary):
+    """A boundary of a line, with a special point of each kind."""
+
+    names = ("stops.0.gap", "stops.0.restitution")
+    parameters = np.array([[1.0, 0.2], [2.0, 0.8]])
+    impact_speed = np.zeros((2, 1))
+    special = tuple(SimpleNamespace(kind=k, parameters=np.array([1.5, 0.5])) for k in KINDS)
+
+
+@pytest.mark.parametrize("kind", FOLLOWED)
+def test_curves_of_every_kind_are_drawn(kind):
+    problem = SimpleNamespace(cycles=1, machine=SCENE, conditions=(SimpleNamespace(kind=kind),))
+    curve = Drawn(problem=problem, steps=[], ends=("bounds", "bounds"))
+    ax = vi.plot_boundary(curve, ax=Figure().subplots())
+    labels = [line.get_label() for line in ax.lines]
+    assert labels[0] == kind and set(KINDS) <= set(labels)
+    dashes = [row.dash for row in KINDS.values() if row.dash is not None]
+    assert len({str(dash) for dash in dashes}) == len(dashes) == len(FOLLOWED)

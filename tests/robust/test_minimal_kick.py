@@ -10,6 +10,8 @@ from vi_jax.robust import _minimal_kick
 
 from belts import Belt
 
+pytestmark = pytest.mark.slow
+
 # This scene has two stable motions of period 4π, with one impact and with two.
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.02)
 
@@ -43,7 +45,6 @@ def row_of(state):
     return np.array([float(state.Y), float(state.V)])
 
 
-@pytest.mark.slow
 def test_the_minimal_kick_agrees_with_bisection_along_it(motions, result, two_impacts):
     begin, there = row_of(motions[0].state), row_of(result.start)
     size = np.linalg.norm(there - begin)
@@ -60,7 +61,6 @@ def test_the_minimal_kick_agrees_with_bisection_along_it(motions, result, two_im
     assert result.lanes < 42_000  # 1 % of a map with 2,048² starts
 
 
-@pytest.mark.slow
 def test_no_smaller_kick_leads_elsewhere(motions, result, two_impacts):
     """Check all directions, and many close to that of the kick. A slightly harder kick escapes."""
     begin, angle = row_of(motions[0].state), np.arctan2(result.kick["V"], result.kick["Y"])
@@ -73,7 +73,6 @@ def test_no_smaller_kick_leads_elsewhere(motions, result, two_impacts):
     assert np.asarray(two_impacts(begin + (1 + 1e-7) * around)).any()
 
 
-@pytest.mark.slow
 def test_the_edge_state_is_the_saddle(motions, result):
     saddle = vi.find_orbit(SCENE, SCENE.start(Y=1.26, V=1.086), 2)
     assert saddle.successful and not saddle.stable
@@ -84,7 +83,6 @@ def test_the_edge_state_is_the_saddle(motions, result):
         assert np.abs(sections - row_of(edge.orbit.state)).max(axis=1).min() < 1e-8
 
 
-@pytest.mark.slow
 def test_a_weighted_norm(motions, two_impacts, monkeypatch):
     """No kick within the ellipse of the weighted norm leads elsewhere. A kick that two rays find is
     listed once."""
@@ -105,7 +103,6 @@ def test_a_weighted_norm(motions, two_impacts, monkeypatch):
     assert np.asarray(two_impacts(begin + (1 + 1e-7) * around)).any()
 
 
-@pytest.mark.slow
 def test_invalid_arguments_raise(motions, result):
     ask = vi.minimal_kick
     with pytest.raises(ValueError, match="`orbit` must be a stable orbit"):
@@ -131,7 +128,6 @@ def moved_to_section(motion, number, of):
     return vi.find_orbit(there, there.start(Y=samples.Y[number], V=samples.V[number]), 2)
 
 
-@pytest.mark.slow
 def test_a_kick_at_a_phase_equals_that_on_a_section_there(motions):
     here = moved_to_section(motions[0], 6, 4)
     given = {"components": ["V"], "candidates": 1, "progress": False}
@@ -142,7 +138,6 @@ def test_a_kick_at_a_phase_equals_that_on_a_section_there(motions):
     assert float(found.kick["V"]) == pytest.approx(float(there.kick["V"]), abs=1e-10)
 
 
-@pytest.mark.slow
 def test_invalid_phases_raise(motions):
     ask = vi.minimal_kick
     with pytest.raises(TypeError, match="`phase` must be"):
@@ -194,7 +189,6 @@ def third(Y, V, x):
 HOME = third(0.0, 0.0, 1.0)
 
 
-@pytest.mark.slow
 def test_a_chaotic_edge_state():
     """Ueda's oscillator with amplitude 7.5 is chaotic."""
     edge = vi.edge_state(Between(push=7.5), HOME, third(1.0, 0.5, -0.5), rounds=24)

@@ -118,9 +118,8 @@ def disc_and_rest(size=40, *, beyond=0.8):
     label = np.where(Y**2 + V**2 < 0.6**2, 0, 1)
     result = np.where(V > beyond, 1, 0)
     coords = {"start.Y": x, "start.V": x}
-    data = xr.Dataset(
-        {"label": (tuple(coords), label), "result": (tuple(coords), result)}, coords=coords
-    )
+    of, names = {"label": label, "result": result}, tuple(coords)
+    data = xr.Dataset({name: (names, x) for name, x in of.items()}, coords=coords)
     sections = {"Y": np.array([0.1, 0.0]), "V": np.array([0.0, -0.3])}
     inside = vi.Attractor(0, 2, 1.0, sections, 1, 0.3, 0.01)
     outside = vi.Attractor(1, 1, 1.0, {"Y": np.array([5.0]), "V": np.array([0.0])}, 1, 0.7, 0.01)

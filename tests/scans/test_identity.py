@@ -55,17 +55,11 @@ class Plain:
         return {"depth": self.gain * run.y_min[-1]}
 """
 THINGS = {
-    "measure": "measure",
-    "lambda": "(\n    lambda scene, run: {'depth': helper(run.y_min[-1])}\n)",
-    "partial": "functools.partial(measure, power=3)",
-    "compiled": "jax.jit(measure)",
-    "filtered": "eqx.filter_jit(measure)",
-    "mapped": "jax.vmap(measure)",
-    "closure": "maker(0.1)",
-    "module": "Depth()",
-    "scene": "Ball()",
-    "object": "Plain()",
-}
+    "measure": "measure", "lambda": "(\n    lambda scene, run: {'depth': helper(run.y_min[-1])}\n)",
+    "partial": "functools.partial(measure, power=3)", "compiled": "jax.jit(measure)",
+    "filtered": "eqx.filter_jit(measure)", "mapped": "jax.vmap(measure)", "closure": "maker(0.1)",
+    "module": "Depth()", "scene": "Ball()", "object": "Plain()",
+}  # fmt: skip
 LIST = "\nTHINGS = {" + ",\n".join(f"{name!r}: {text}" for name, text in THINGS.items()) + "}\n"
 
 
@@ -90,16 +84,14 @@ MEASURES = {"measure", "compiled", "filtered", "mapped", "partial"}
 @pytest.mark.parametrize(
     "old, new, changed",
     [
-        ("FACTOR = 2.0", "FACTOR = 2.0  # unit: a", set()),
-        ("power=2)", "power=3)", MEASURES),
+        ("FACTOR = 2.0", "FACTOR = 2.0  # unit: a", set()), ("power=2)", "power=3)", MEASURES),
         ("maker(offset):\n", "maker(offset):\n    offset = 2 * offset\n", {"closure"}),
-        ("-9.81", "-9.82", {"scene"}),
-        ("self.gain = 1.5", "self.gain = 1.6", {"object"}),
+        ("-9.81", "-9.82", {"scene"}), ("self.gain = 1.5", "self.gain = 1.6", {"object"}),
         ('return {"depth": self.scaled', 'return {"deep": self.scaled', {"module"}),
         ("power: float = 2.0", "power: float = 3.0", {"module"}),
         ("FACTOR = 2.0", "FACTOR = 3.0", {*MEASURES, "lambda", "module"}),
     ],
-)
+)  # fmt: skip
 def test_changes_of_source_change_the_identity(identities, old, new, changed):
     assert old in SOURCE
     before, after = (

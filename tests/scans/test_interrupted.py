@@ -15,10 +15,8 @@ VALUES = jnp.linspace(0.7, 1.3, 40)
 
 def interrupt_at(monkeypatch, place, after):
     """Raise `KeyboardInterrupt` at the call of a function after `after` calls."""
-    module, name = (
-        importlib.import_module("vi_jax." + place.rpartition(".")[0]),
-        place.split(".")[2],
-    )
+    path, _, name = f"vi_jax.{place}".rpartition(".")
+    module = importlib.import_module(path)
     real, left = getattr(module, name), [after]
 
     def until(*arguments, **options):
@@ -43,9 +41,8 @@ def test_an_interrupted_sweep_keeps_completed_values(monkeypatch):
     whole = vi.sweep(MOTOR, "drive.control", VALUES, settle=4, cycles=4)
     assert whole.values.shape == (40,) and bool(whole.successful.all())
     interrupt_at(monkeypatch, "scans._sweep._sweep", after=2)
-    error = interrupted_by(
-        vi.Interrupted, lambda: vi.sweep(MOTOR, "drive.control", VALUES, settle=4, cycles=4)
-    )
+    call = lambda: vi.sweep(MOTOR, "drive.control", VALUES, settle=4, cycles=4)
+    error = interrupted_by(vi.Interrupted, call)
     part = error.partial
     assert "the sweep was interrupted" in str(error)
     assert isinstance(part, vi.Sweep)
@@ -72,9 +69,8 @@ def test_interrupted_basins_keep_completed_starts(monkeypatch):
     interrupt_at(monkeypatch, "scans._basins._last_sections", after=0)
     scene = vi.Scene.ideal(frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.2)
     options = {"resolution": 4, "settle": 10, "longest": 4, "progress": False}
-    error = interrupted_by(
-        vi.Interrupted, lambda: vi.basins(scene, {"start.Y": (-1.0, 1.0)}, **options)
-    )
+    call = lambda: vi.basins(scene, {"start.Y": (-1.0, 1.0)}, **options)
+    error = interrupted_by(vi.Interrupted, call)
     assert error.partial["period"].shape == (4,)
 
 

@@ -128,10 +128,7 @@ def test_a_sweep_uses_a_key_for_each_value():
         ({"key": None}, "Argument `key` must be one key"),
         ({"noise": None}, "Argument `key` needs noise"),
         ({"noise": None, "key": None}, "names 'noise.V', needs noise"),
-        (
-            {"noise": vi.WhiteNoise({"W": 0.5})},
-            r"of the noise \(noise.W, noise.path\), but got 'noise.V'",
-        ),
+        ({"noise": vi.WhiteNoise({"W": 0.5})}, r"\(noise.W, noise.path\), but got 'noise.V'"),
         ({"derivatives": "noise.path"}, r"number of the noise \(noise.V\), but got 'noise.path'"),
     ],
 )

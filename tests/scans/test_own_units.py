@@ -1,5 +1,4 @@
-"""The unit of each component, the section and the order of events do not change sweeps and
-basins."""
+"""The unit of each component and the section do not change sweeps and basins."""
 
 import jax
 import numpy as np
@@ -18,8 +17,8 @@ REGIONS = {
 }
 
 
-def assert_same_sweeps(kind, first=None):
-    values = np.linspace(*kind.bounds, 6)
+def assert_same_sweeps(kind):
+    values, first = np.linspace(*kind.bounds, 6), None
     for machine in variants(kind):
         run = vi.sweep(machine, "p", values, start=machine.start(), settle=200, progress=False)
         # Near an equilibrium turns are rounding, and without them a cycle does not end.
@@ -30,21 +29,19 @@ def assert_same_sweeps(kind, first=None):
         case = str(machine)
         for x, y in zip(found, first, strict=True):
             np.testing.assert_array_equal(x, y, err_msg=case)
-    return first
 
 
+PRECISIONS = pytest.mark.parametrize("double", [True, False], ids=["double", "single"])
+
+
+@PRECISIONS
 @pytest.mark.parametrize("kind", MACHINES)
-def test_sweeps(kind):
-    assert_same_sweeps(kind)
-
-
-@pytest.mark.parametrize("kind", MACHINES)
-def test_sweeps_in_single_precision(kind):
-    with jax.enable_x64(False):
+def test_sweeps(kind, double):
+    with jax.enable_x64(double):
         assert_same_sweeps(kind)
 
 
-@pytest.mark.parametrize("double", [True, False], ids=["double", "single"])
+@PRECISIONS
 @pytest.mark.parametrize("kind", REGIONS)
 def test_basins(kind, double):
     with jax.enable_x64(double):

@@ -5,6 +5,8 @@ import pytest
 import vi_jax as vi
 import xarray as xr
 
+from shaken_oscillator import Shaken
+
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
 
 AXES = {
@@ -38,10 +40,8 @@ def test_lanes_agree_with_runs(data):
 def test_power_is_the_loss_in_impacts():
     orbit = vi.closed_form_orbits(SCENE, cycles=1)
     start = SCENE.start(Y=orbit.Y[0], V=orbit.V[0])
-    scene = SCENE
-    found = vi.scan(
-        scene, {"stops.0.restitution": [0.5]}, start=start, measure="power", settle=0, cycles=40
-    )
+    options = {"start": start, "measure": "power", "settle": 0, "cycles": 40}
+    found = vi.scan(SCENE, {"stops.0.restitution": [0.5]}, **options)
     expected = 0.5 * (1 - 0.25) * float(orbit.impact_speed[0]) ** 2 * 0.9 / (2 * np.pi)
     assert float(found.power[0]) == pytest.approx(expected, rel=1e-6)
 
@@ -63,9 +63,8 @@ def test_blocks_do_not_change_results(data):
         "start.Y": np.tile(np.linspace(-1, 1, 200), 7),
     }
     pair = vi.scan(SCENE, rows, measure="extremes", settle=20, paired=True, lanes=256)
-    grid = vi.scan(
-        SCENE, {**AXES, "start.Y": np.linspace(-1, 1, 200)}, measure="extremes", settle=20
-    )
+    finer = {**AXES, "start.Y": np.linspace(-1, 1, 200)}
+    grid = vi.scan(SCENE, finer, measure="extremes", settle=20)
     assert pair.y_min.dims == ("sample",)
     np.testing.assert_array_equal(np.asarray(pair.y_min), np.asarray(grid.y_min).ravel())
 
@@ -119,9 +118,8 @@ def test_user_defined_measures_scenes_and_starts():
 @pytest.mark.slow
 def test_derivatives_agree_with_those_of_a_run():
     names = ("drive.frequency_ratio", "start.V", "stops.0.gap")
-    data = vi.scan(
-        SCENE, {"start.Y": [0.1, 0.4]}, measure="extremes", settle=5, cycles=1, derivatives=names
-    )
+    options = {"measure": "extremes", "settle": 5, "cycles": 1, "derivatives": names}
+    data = vi.scan(SCENE, {"start.Y": [0.1, 0.4]}, **options)
 
     def y_min(zeta, V, gap):
         scene = vi.Scene.ideal(frequency_ratio=zeta, gap=gap, damping_ratio=0.01)
@@ -153,15 +151,13 @@ def test_failing_lanes_are_counted_and_do_not_change_others():
         ({"axes": {"start.W": [1.0]}}, "`axes` must be a number of the machine"),
         ({"axes": {"drive.frequency_ratio": [1.0, np.nan]}}, "finite"),
         ({"axes": {"stops.0.restitution": [0.5, 1.5]}}, r"`restitution`.*\[0, 1\]"),
-        ({"axes": {}}, "`axes` must map"),
-        ({"measure": "extreme"}, "near names: extremes"),
+        ({"axes": {}}, "`axes` must map"), ({"measure": "extreme"}, "near names: extremes"),
         ({"cycles": 12}, "at least 128 for the measure Regime"),
         ({"derivatives": ["stops.1.gap"]}, "near names: stops.0.gap"),
         ({"store": "/dev/null/x"}, "`store` must be a path"),
-        ({"devices": 99}, "`devices` must be at most"),
-        ({"paired": True}, "rows of one length"),
+        ({"devices": 99}, "`devices` must be at most"), ({"paired": True}, "rows of one length"),
     ],
-)
+)  # fmt: skip
 def test_invalid_arguments_raise_before_any_work(change, message):
     arguments = {"axes": AXES, **change}
     with pytest.raises((ValueError, TypeError), match=message):
@@ -193,3 +189,48 @@ def test_unused_extremes_are_not_computed():
     )
     assert (lean.steps < full.steps).all()
     np.testing.assert_array_equal(lean.impact_rate, full.impact_rate)
+
+
+FREQUENCIES = np.array([0.76, 0.77, 0.78])
+OBSERVED = {"settle": 60, "cycles": 8}
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Simulate each frequency separately."""
+    found = []
+    for frequency in FREQUENCIES:
+        machine = Shaken(frequency=frequency)
+        found.append(vi.simulate(machine, machine.start(), 8, settle=60))
+    return found
+
+
+def test_a_scan_measures_an_average_by_its_name(runs):
+    wanted = [run.averages["taken"].mean() for run in runs]
+    for machine in (Shaken(), lambda frequency: Shaken(frequency=frequency)):
+        data = vi.scan(
+            machine, {"frequency": FREQUENCIES}, measure=("taken", "power"), start=Shaken().start(),
+            progress=False, **OBSERVED,
+        )  # fmt: skip
+        np.testing.assert_allclose(data.taken, wanted, rtol=1e-9)
+        assert data.taken.attrs["units"] == "W" and "power" in data
+    with pytest.raises(ValueError, match="near names: taken"):
+        vi.scan(Shaken(), {"frequency": FREQUENCIES}, measure="takes")
+
+
+def test_a_sweep_has_averages(runs):
+    swept = vi.sweep(Shaken(), "frequency", FREQUENCIES[:1], **OBSERVED)
+    np.testing.assert_allclose(swept.averages["taken"][0], runs[0].averages["taken"].mean())
+    assert swept.to_xarray().taken.attrs["units"] == "W"
+    ax = vi.plot_sweep(swept, y="taken")
+    assert ax.get_ylabel() == "mean taken (W)"
+    with pytest.raises(ValueError, match="'lost', 'taken'"):
+        vi.plot_sweep(swept, y="given")
+
+
+@pytest.mark.slow
+def test_exponents_have_averages(runs):
+    machine = Shaken(frequency=FREQUENCIES[0])
+    found = vi.lyapunov(machine, runs[0].last, 8, settle=0, number=1)
+    np.testing.assert_allclose(found.averages["taken"], runs[0].averages["taken"][-1], rtol=1e-6)
+    assert "mean taken: " in repr(found) and found.to_xarray().taken.attrs["units"] == "W"

@@ -179,9 +179,7 @@ def test_a_lane_ends_at_its_escape(of, samples, settle):
     alone = vi.Escape(of, high=2.0, samples=samples)
     other = vi.Density({"V": EDGES}, samples=samples)
     short, long = (
-        vi.scan(
-            Free(), {"noise.path": np.arange(64)}, start=START, measure=m, progress=False, **given
-        )
+        vi.scan(Free(), {"noise.path": np.arange(64)}, start=START, measure=m, **given)
         for m in (alone, (alone, other))
     )
     assert 5 < int(short.escaped.sum()) < 64
@@ -266,6 +264,4 @@ def test_invalid_arguments_raise(make, message):
 
 
 def scan_of(measure, cycles=32):
-    return vi.scan(
-        Free(), {"start.Y": [0.0]}, measure=measure, start=START, cycles=cycles, progress=False
-    )
+    return vi.scan(Free(), {"start.Y": [0.0]}, measure=measure, start=START, cycles=cycles)

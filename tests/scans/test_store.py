@@ -49,12 +49,10 @@ def _cut(path):
     [
         ("deleted", "y_min/c/1", "y_min/c/1", 1),
         ("deleted", "y_min", "y_min/c/0, y_min/c/1, y_min/c/2", 3),
-        (_cut, "y_max/c/2", "y_max/c/2", 1),
-        (_flip, "impact_speed/c/0", "impact_speed/c/0", 1),
-        (_flip, "result/c/0", "result/c/0", 1),
-        (_cut, "start.Y/c/0", "start.Y", 0),
+        (_cut, "y_max/c/2", "y_max/c/2", 1), (_flip, "impact_speed/c/0", "impact_speed/c/0", 1),
+        (_flip, "result/c/0", "result/c/0", 1), (_cut, "start.Y/c/0", "start.Y", 0),
     ],
-)
+)  # fmt: skip
 def test_damaged_blocks_are_computed_again_with_a_warning(
     whole, tmp_path, monkeypatch, damage, where, words, blocks
 ):
@@ -129,9 +127,7 @@ def test_failed_lanes_do_not_count_as_damage(tmp_path):
 
     def run():
         axes = {"start.Y": np.linspace(2.5, 3.0, 256)}
-        return vi.scan(
-            SCENE, axes, measure="extremes", settle=5, cycles=4, workers=1, store=tmp_path / "s"
-        )
+        return vi.scan(SCENE, axes, measure="extremes", settle=5, cycles=4, store=tmp_path / "s")
 
     with pytest.warns(UserWarning, match="256 of 256 lanes failed"):
         run()

@@ -46,21 +46,12 @@ def _described(y_min, period, impacts, zeta=None):
     size = len(y_min)
     zeros = jnp.zeros(size)
     sweep = vi.Sweep(
-        parameter="drive.control",
-        values=1 + 0.1 * jnp.arange(size, dtype=float),
-        y_min=jnp.array(y_min),
-        y_max=zeros,
-        period=jnp.array(period),
-        impacts=jnp.array(impacts),
-        frequency_ratio=None if zeta is None else jnp.array(zeta),
-        impact_speed=zeros,
-        impact_energy=zeros,
-        sections=None,
-        result=vi.RESULTS.successful,
-        labels=SCENE.labels,
-        periods=tuple(f"{2 * n}π" for n in range(1, 9)),
-        units=tuple(SCENE.units.items()),
-    )
+        parameter="drive.control", values=1 + 0.1 * jnp.arange(size, dtype=float),
+        y_min=jnp.array(y_min), y_max=zeros, period=jnp.array(period), impacts=jnp.array(impacts),
+        frequency_ratio=None if zeta is None else jnp.array(zeta), impact_speed=zeros,
+        impact_energy=zeros, sections=None, result=vi.RESULTS.successful, labels=SCENE.labels,
+        periods=tuple(f"{2 * n}π" for n in range(1, 9)), units=tuple(SCENE.units.items()),
+    )  # fmt: skip
     return str(sweep).splitlines()[1:]
 
 

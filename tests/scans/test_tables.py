@@ -45,9 +45,8 @@ def test_a_batch_in_tables():
     with pytest.raises(ValueError, match=r"`dims` must name the 1 batch axes .* 'gap'"):
         run.to_xarray("gap")
     lanes = run.to_xarray(["gap"], along="gap").to_dataframe()
-    assert (
-        lanes.result.tolist() == ["successful"] * 3 and lanes.steps.tolist() == run.steps.tolist()
-    )
+    assert lanes.result.tolist() == ["successful"] * 3
+    assert lanes.steps.tolist() == run.steps.tolist()
 
 
 def test_a_sweep_and_its_exponents():

@@ -1,10 +1,12 @@
-"""Motor scenes: energy, stall, start from rest and strong motors."""
+"""Scenes: energy, stall, start from rest, strong motors; the ideal drive in closed form."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from scipy.linalg import expm
+from vi_jax.flow.methods.exact import flight
 
 
 @pytest.mark.parametrize("crank", ["cosine", "slider"])
@@ -61,3 +63,25 @@ def test_fixed_steps_stay_stable_for_a_strong_motor():
     )
     assert bool(good.all())
     np.testing.assert_allclose(found, exact, atol=1e-6)
+
+
+def generator(zeta, xi):
+    """Return the matrix A with dx/dτ = A x between impacts, for x = (Y, V, cos φ, sin φ)."""
+    matrix = np.zeros((*np.shape(zeta), 4, 4))
+    matrix[..., 0, 1], matrix[..., 1, 0], matrix[..., 1, 1] = 1.0, -1.0, -2 * xi
+    matrix[..., 1, 2], matrix[..., 2, 3], matrix[..., 3, 2] = 1.0, -zeta, zeta
+    return matrix
+
+
+def test_flight_is_the_matrix_exponential():
+    """Weak, critical and strong damping, resonance, and both sides of the switch near resonance."""
+    zetas = [1e-3, 0.4, 1.0, 1 + 1e-9, 1 - 1e-6, 1.001, 0.991, 1.011, 30.0]
+    zeta, xi = map(np.ravel, np.meshgrid(zetas, [0.0, 1e-4, 0.3, 1.0, 1.5, 10.0]))
+    draw = np.random.default_rng(0)
+    phase, (Y, V) = draw.uniform(0, 6.28), draw.normal(size=2)
+    tau = 0.4 * np.pi / np.maximum(1.0, np.maximum(zeta, xi))
+    found = jax.jit(jax.vmap(lambda z, x, t: flight(z, x, phase, Y, V, t)))(
+        *map(jnp.asarray, (zeta, xi, tau))
+    )
+    truth = expm(generator(zeta, xi) * tau[:, None, None]) @ [Y, V, np.cos(phase), np.sin(phase)]
+    np.testing.assert_allclose(np.stack(found, -1), truth[:, :2], atol=2e-13)
