@@ -316,6 +316,7 @@ def _mean_duration(the_map: CycleMap, own, start, carry, cycles: int) -> Scalar 
     (x, modes), *_ = carry
     state = with_modes(ravel_pytree(without_modes(start))[1](x), modes)
     run = simulate(own, state, cycles + 1, method=the_map.method, rests=the_map.rests)
+    assert run.duration is not None  # by default it is recorded
     duration = run.duration[1:]
     mean = _weighted(duration[:, None], jnp.ones_like(duration))[0][0]
     return jnp.where(run.successful, mean, jnp.nan)
