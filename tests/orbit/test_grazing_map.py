@@ -68,3 +68,6 @@ def test_periods_of_a_strongly_unstable_motion():
         expected = (shares * np.linalg.solve(vectors, kick)) @ vectors.T
         np.testing.assert_allclose(local.kicked(n), expected, rtol=1e-12, atol=1e-14)
     assert np.isnan(windows(local, 1e-2, 16).stable).all()
+    # Nothing stays near, not even the smooth motion on the other side, which is met exactly.
+    offsets = np.geomspace(1e-6, 1e-2, 8)
+    assert (find_attractors(local, np.append(offsets, -offsets)).period == -1).all()

@@ -44,6 +44,7 @@ from .flight import Event as MotionEvent
 from .hopf import hopf_between, size_of_cycle
 from .kinds import (
     CROSSING,
+    CROSSING_SLIDING,
     DOUBLING,
     EXTREMUM,
     FOLD,
@@ -192,6 +193,9 @@ class MotionTable(Table):
             place = place_in_words(self.problem, at, change.clock)
             detail = (KINDS[change.kind].parts or ())[change.exists]
             detail = detail.format(name=switch_name, place=place)
+            switch = MotionEvent(change.number).of(self.problem.at(at.x))
+            if change.kind != CROSSING_SLIDING and float(getattr(switch, "static_ratio", 1.0)) > 1:
+                detail += ", by a jump, as static friction is larger"
             return self._end_with(change.kind, at, detail, impact)
         if text is not None:
             return self._end_with(GRAZING, at, text(at))

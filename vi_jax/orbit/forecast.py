@@ -79,11 +79,11 @@ def periods_in(rows: np.ndarray, hits: np.ndarray, size: np.ndarray) -> np.ndarr
 
 
 def transient_length(local: LocalMap) -> int:
-    """Return the number of iterates of the transient, from the slowest multiplier."""
-    slowest = np.abs(np.linalg.eigvals(local.matrix)).max()
-    if slowest <= 0 or slowest >= 1:
-        return _FEWEST if slowest <= 0 else _MOST
-    return int(np.clip(np.log(SAME) / np.log(slowest), _FEWEST, _MOST))
+    """Return the number of iterates of the transient, from the multiplier that decays or grows most
+    slowly."""
+    with np.errstate(divide="ignore"):
+        rate = np.abs(np.log(np.abs(np.linalg.eigvals(local.matrix)))).min()
+        return int(np.clip(-np.log(SAME) / rate, _FEWEST, _MOST))
 
 
 def kick_sizes(local: LocalMap, offsets: np.ndarray) -> np.ndarray:
@@ -117,7 +117,9 @@ def _iterate(local: LocalMap, offsets: np.ndarray) -> Attractors:
                     if k == 0:
                         places[:, i] = kicked
         period = periods_in(places, hits, size)
-    is_lost = ~(np.abs(z).max(axis=1) <= _LOST * size)
+    # The smooth motion is met exactly, though it attracts none if it is unstable.
+    is_unstable = np.abs(np.linalg.eigvals(local.matrix)).max() > 1
+    is_lost = ~(np.abs(z).max(axis=1) <= _LOST * size) | (is_unstable & ~hits.any(axis=1))
     period = np.where(is_lost, -1, period)
     return Attractors(period, impacts_in(hits, period), places, deepest)
 

@@ -460,7 +460,7 @@ def _jump(blank: Shooting, number: int, s, u, modes):
 
 
 # Most events of a cycle that are logged, and of a period that are followed: choices.
-_LOGGED, _FOLLOWED = 512, 24
+_LOGGED, _FOLLOWED = 512, 64
 
 # The state before an event is taken earlier by this share of a cycle: a choice, far above rounding
 # and within the reach of the corrector.
@@ -493,7 +493,12 @@ def resting_problem_of(
     events = _grouped(log, begins[-1] / cycles, begins[-1])
     if autonomous and events == []:
         events = [(float(begins[n]), section_of(machine, n)) for n in range(cycles)]
-    if events is None or len(events) > _FOLLOWED:
+    if events is not None and len(events) > _FOLLOWED:
+        raise ValueError(
+            f"Argument `orbit` has {len(events)} events in a period, without the hops of its "
+            f"chatters. A branch of motions that rest follows at most {_FOLLOWED}."
+        )
+    if events is None:
         raise ValueError(
             "Argument `orbit` must come to rest on its stops after chatters of one body at a time, "
             "in whose last hops no switch changes, but several bodies chatter together or a switch "

@@ -84,16 +84,18 @@ def simulate_attractors(graze: LocalGrazing, offsets: np.ndarray) -> SimulatedAt
     displacements, smooth = displacements / graze.sizes, smooth / graze.sizes
     hits = impacts.reshape(len(rows), SOUGHT, problem.cycles).sum(axis=2) - len(problem.impacts)
     size = kick_sizes(local, offsets)
-    u, kick_sum = local.kicks.T, np.zeros(len(section.state))
-    for _ in range(LONGEST):  # farther off than the sum of so many kicks a motion has left
-        kick_sum += np.abs(section.matrix @ u).max(axis=1)
-        u = local.matrix @ u
     unit = np.abs(local.kicks).max()
     reach = np.abs(section.matrix @ local.kicks.T).max() / unit * size
     rounding = CORRECTED * np.abs(smooth).max()
     period = periods_in(displacements, hits, reach + rounding)
     deepest = local_depths(local, offsets) ** (2 * local.orders.min())
-    is_away = np.abs(displacements).max(axis=(1, 2)) > kick_sum.max() * deepest + rounding
+    # Farther off than by the sum of so many kicks a motion has left: of earlier ones in stable
+    # directions, of later ones, which must bring it back, in unstable ones.
+    kick_sum = max(
+        np.abs(local.kicked(LONGEST, i)[1:] @ section.matrix.T).sum(axis=0).max()
+        for i in range(len(local.kicks))
+    )
+    is_away = np.abs(displacements).max(axis=(1, 2)) > kick_sum * deepest + rounding
     is_finite = is_finite & np.isfinite(displacements).all(axis=(1, 2))
     span = np.abs(displacements).max(axis=(1, 2), initial=0.0, where=np.isfinite(displacements))
     far = np.where(is_finite & is_away, periods_in(displacements, hits, ALIKE * span), 0)
@@ -143,7 +145,8 @@ def positions(graze: LocalGrazing, offsets: np.ndarray, displacements: np.ndarra
     """Return the first coordinate at displacements, in the sizes of the state, from the smooth
     section state, less its own."""
     smooth = graze.section.state + np.outer(offsets, graze.section.slope)
-    moved = _position_of(graze.problem, smooth[:, None] + displacements * graze.sizes)
+    with np.errstate(invalid="ignore", over="ignore"):  # a motion that leaves may overflow
+        moved = _position_of(graze.problem, smooth[:, None] + displacements * graze.sizes)
     return moved - _position_of(graze.problem, smooth)[:, None]
 
 
@@ -285,7 +288,11 @@ class Grazing(Summarized):
                 f"{100 * self.agreement:.3g} % of the values alike"
             )
         elif self.machine is not None:
-            lines.append("  checked by the machine: it does not agree at these values")
+            low, high = np.abs(self.machine.offset[[0, -1]])
+            lines.append(
+                f"  checked by the machine: in no half decade from {low:.3g} to {high:.3g} are "
+                f"{100 * _AGREES:g} % of the values alike on both sides"
+            )
         return "\n".join(lines)
 
     @property

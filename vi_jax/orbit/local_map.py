@@ -59,14 +59,14 @@ class LocalMap(eqx.Module):
             found.append(self.gradients[0] @ u)
         return np.array(found)
 
-    def kicked(self, n: int) -> np.ndarray:
+    def kicked(self, n: int, touch: int = 0) -> np.ndarray:
         """Return the states after the kick and after each of n periods, (n + 1, states), of a
-        motion with one kick of depth one in n periods. They are solved for together, as a power of
-        an unstable matrix is singular to rounding."""
+        motion with one kick of depth one in n periods, at this touch. They are solved for together,
+        as a power of an unstable matrix is singular to rounding."""
         size = len(self.matrix)
         steps = np.kron(np.eye(n + 1, k=-1), self.matrix)
         steps[:size, -size:] += np.eye(size)  # the last one precedes the kick
-        right = np.append(self.kicks[0], np.zeros(n * size))
+        right = np.append(self.kicks[touch], np.zeros(n * size))
         return np.linalg.solve(np.eye(len(steps)) - steps, right).reshape(n + 1, size)
 
     def passages(self, n: int) -> np.ndarray:

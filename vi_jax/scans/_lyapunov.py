@@ -75,8 +75,8 @@ class Lyapunov(Summarized):
     exponents: Float[Array, "... states"]
     """The spectrum, greatest first: growth rates per unit of time (`unit`, for a `Scene` ω)."""
     per_cycle: Float[Array, "... states"]
-    """The same per drive cycle (dimensionless): ln|multipliers|/n on an orbit of n cycles. An
-    autonomous machine is observed at intervals of its usual `cycle`, which count as cycles."""
+    """The same per cycle (dimensionless): ln|multipliers|/n on an orbit of n cycles. NaN if events
+    end the cycles of the machine, but the motion has none."""
     spread: Float[Array, "..."]
     """Difference of the greatest exponent between the two halves of the run."""
     state: State
@@ -185,11 +185,12 @@ def lyapunov(
     cycles, progress = count("cycles", cycles, least=8), flag("progress", progress)
     machine = machine_of(machine)
     start = machine.start() if start is None else start
-    own = len(components(without_modes(start))) if has_delays(machine) else None
-    the_map, start = _observed_map(*as_chain(machine, start), method, rests)
+    count_of_own = len(components(without_modes(start))) if has_delays(machine) else None
+    own, start = as_chain(machine, start)
+    the_map, start = _observed_map(own, start, method, rests)
     machine = the_map.machine
     states = int(_is_free(machine, start).sum())
-    number = (own or states) if number is None else count("number", number, least=1)
+    number = (count_of_own or states) if number is None else count("number", number, least=1)
     if number > states:
         raise ValueError(
             f"Argument `number` must be at most {states}, the free states of the machine, but got "
@@ -205,14 +206,16 @@ def lyapunov(
 
         def joined(carry, parts) -> Lyapunov:
             observed = jtu.tree_map(lambda *x: jnp.concatenate(x), *parts)
-            return _compiled_result(the_map, start, carry, observed)
+            return _compiled_result(the_map, start, carry, observed, duration)
 
+        begin = _initial_carry(the_map, start, settle, number)
+        duration = _mean_duration(the_map, own, start, begin, 2 * _AT_ONCE)
         return in_parts(
-            "observation of exponents", step, _initial_carry(the_map, start, settle, number),
+            "observation of exponents", step, begin,
             ((size, size // window) for size in pieces), joined, progress=progress, unit="cycle",
             total=cycles,
         )  # fmt: skip
-    return _lyapunov(the_map, start, cycles, settle, number)
+    return _lyapunov(the_map, own, start, cycles, settle, number)
 
 
 def _observed_map(
@@ -301,11 +304,27 @@ def observe_growth(
 
 
 @compiled
-def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
+def _lyapunov(the_map: CycleMap, own, start, cycles: int, settle, number: int) -> Lyapunov:
     carry = _initial_carry(the_map, start, settle, number)
+    duration = _mean_duration(the_map, own, start, carry, cycles)
     window = _window(cycles) if number == 1 else 1
     carry, found = jax.lax.scan(_observer(the_map, start, window), carry, length=cycles // window)
-    return _result_of(the_map, start, carry, found)
+    return _result_of(the_map, start, carry, found, duration)
+
+
+@compiled
+def _mean_duration(the_map: CycleMap, own, start, carry, cycles: int) -> Scalar | None:
+    """Return the mean duration of the cycles that events of the machine `own` end, after the one in
+    which the observation begins, or NaN without such cycles; `None` if the clock ends them."""
+    if not is_autonomous(own, without_modes(start)):
+        return None
+    (x, modes), *_ = carry
+    state = with_modes(ravel_pytree(without_modes(start))[1](x), modes)
+    run = simulate(own, state, cycles + 1, method=the_map.method, rests=the_map.rests)
+    assert run.duration is not None  # by default it is recorded
+    duration = run.duration[1:]
+    mean = _weighted(duration[:, None], jnp.ones_like(duration))[0][0]
+    return jnp.where(run.successful, mean, jnp.nan)
 
 
 @compiled
@@ -393,8 +412,9 @@ def _observer(the_map: CycleMap, start, window: int, rows: bool = False) -> Any:
     return observe
 
 
-def _result_of(the_map: CycleMap, start, carry, observed) -> Lyapunov:
-    """Return the exponents. **Arguments:** `carry` and `observed`, from `_observer`'s function."""
+def _result_of(the_map: CycleMap, start, carry, observed, length) -> Lyapunov:
+    """Return the exponents. **Arguments:** `carry` and `observed`, from `_observer`'s function;
+    `length`, the mean duration of a cycle if events end them."""
     ((x, modes), _, result), (rates, duration, integrals) = carry, observed
     rates, duration, machine = rates.reshape(-1, rates.shape[-1]), duration.ravel(), the_map.machine
     mean, halves = _weighted(rates, duration)
@@ -403,7 +423,7 @@ def _result_of(the_map: CycleMap, start, carry, observed) -> Lyapunov:
     sums = jtu.tree_map(lambda x: jnp.where(good, jnp.sum(x), jnp.nan), integrals)
     return Lyapunov(
         exponents=exponents,
-        per_cycle=exponents * jnp.mean(duration),
+        per_cycle=exponents * (jnp.mean(duration) if length is None else length),
         spread=jnp.where(halves[0] == halves[1], 0.0, jnp.abs(halves[0] - halves[1])),
         state=with_modes(ravel_pytree(without_modes(start))[1](x), modes),
         result=result,
