@@ -150,21 +150,23 @@ def begin_modes(
 def struck_modes(
     machine: Machine, s: Scalar, state: State, modes: Modes, own: Sequence[Any] | None = None,
     contact: Scalars = (), before: State | None = None, released: dict[int, Any] | None = None,
+    jump: tuple[Scalar, State] | None = None,
 ) -> Modes:  # fmt: skip
     """Return the modes after a jump to `state`, from `before` if that is known; the machine's own
     are unchanged, or `own`. `released` as in `settled_modes`. A body that sticks, and whose slip
-    the jump does not change, sticks on: its slip is an error of the method."""
-    event_modes = []
+    the jump does not change, sticks on: its slip is an error of the method. `jump`: the time of the
+    jump and the state after it, if `state` at `s` is a later one."""
+    event_modes, (at, after) = [], (s, state) if jump is None else jump
     for number, event in enumerate(events_of(machine)):
         if event.holds_mode:
             _, part, keywords = event_of(machine, number, modes, contact)
             mode = event.struck(machine, s, state, *modes[part], **keywords)
             if before is not None and isinstance(event, Switch) and not event.slides:
                 # On its surface, where the sign is rounding, only its own event changes the mode.
-                was, now = (event.function(machine, s, x) for x in (before, state))
+                was, now = (event.function(machine, at, x) for x in (before, after))
                 mode = jnp.where(stop_gradient(was == now), modes[part][0], mode)
             if before is not None and isinstance(event, Friction):
-                sticks = (jnp.abs(modes[part][0]) < 1) & ~event.changes(machine, s, before, state)
+                sticks = (jnp.abs(modes[part][0]) < 1) & ~event.changes(machine, at, before, after)
                 mode = jnp.where(sticks, 0.0, mode)
             event_modes.append(mode)
     machine_modes = modes[len(event_modes) :] if own is None else own

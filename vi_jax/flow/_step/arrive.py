@@ -624,6 +624,7 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
     resolve = resolve_impact_sequence if is_compound(machine) else resolve_impact
     lane, impacts = resolve(plan, step.taken, lane, landed, at_event)
     met = any_of(step.taken, landed.values())
+    jump = at, after = lane.s, lane.state  # a rest comes later, by the time of its last impacts
     lane = bring_to_rest(step, lane, at_event, met, impacts)
     # Coordinates may share a body with one that was hit.
     shared = is_compound(machine) or len(machine.coordinates) > 1
@@ -642,7 +643,7 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
     modes, contact = lane.modes, lane.contact or ()
     if modes and not is_compound(machine):
         for number, here in landed.items():
-            given = machine, lane.s, at_event, lane.state, modes
+            given = machine, at, at_event, after, modes
             modes = select(here, stops_of(machine)[number].modes_after(*given), modes)
     if modes and (is_compound(machine) or (contact and holds_anywhere(machine))):
         # The force that friction has to hold depends on the bodies that rest now.
@@ -653,8 +654,9 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
             rests = any_of(met, (x > 0 for x in contact))
             released = {i: rests & (jnp.abs(modes[i]) >= 1) for i in frictions_in(machine)}
         new = struck_modes(
-            machine, lane.s, lane.state, modes, contact=contact, before=at_event, released=released
-        )
+            machine, lane.s, lane.state, modes, contact=contact, before=at_event,
+            released=released, jump=jump,
+        )  # fmt: skip
         modes = select(met, new, modes)
     lane = lane._replace(direction=tuple(direction), modes=modes)
     if lane.contact is None or len(impacts) == 1:
