@@ -160,16 +160,17 @@ class RigidStop(Wall, AbstractEvent):
         return new, self.modes_after(machine, s, state, new, modes)
 
     def modes_after(
-        self, machine: Machine, s: Scalar, before: State, after: State, modes: Modes
-    ) -> Modes:
+        self, machine: Machine, s: Scalar, before: State, after: State, modes: Modes,
+        jump: tuple[Scalar, State] | None = None,
+    ) -> Modes:  # fmt: skip
         """Return the machine's modes after an impact. **Arguments:** `before` and `after`, the
-        states; `modes`, those before."""
+        states; `modes`, those before; `jump`, as in `struck_modes`."""
         machine_modes = None
         if self.modes is not None:
             found = self.modes(machine, s, before, *shown_modes(machine, modes))
             whose = f"`modes` of a stop of a {type(machine).__name__}"
             machine_modes = modes_after(machine, found, modes, whose)
-        return struck_modes(machine, s, after, modes, machine_modes, before=before)
+        return struck_modes(machine, s, after, modes, machine_modes, before=before, jump=jump)
 
     def jump(self, machine, s, state, *modes):
         body = machine.coordinates[self.coordinate]

@@ -624,7 +624,7 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
     resolve = resolve_impact_sequence if is_compound(machine) else resolve_impact
     lane, impacts = resolve(plan, step.taken, lane, landed, at_event)
     met = any_of(step.taken, landed.values())
-    jump = at, after = lane.s, lane.state  # a rest comes later, by the time of its last impacts
+    jump = lane.s, lane.state  # a rest comes later, by the time of its last impacts
     lane = bring_to_rest(step, lane, at_event, met, impacts)
     # Coordinates may share a body with one that was hit.
     shared = is_compound(machine) or len(machine.coordinates) > 1
@@ -643,7 +643,7 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
     modes, contact = lane.modes, lane.contact or ()
     if modes and not is_compound(machine):
         for number, here in landed.items():
-            given = machine, at, at_event, after, modes
+            given = machine, lane.s, at_event, lane.state, modes, jump
             modes = select(here, stops_of(machine)[number].modes_after(*given), modes)
     if modes and (is_compound(machine) or (contact and holds_anywhere(machine))):
         # The force that friction has to hold depends on the bodies that rest now.
