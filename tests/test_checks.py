@@ -31,7 +31,7 @@ def test_annotations_hold_in_every_verb():
     """Annotations are checked from the import of a module on, so this needs another process."""
     root = Path(__file__).parents[1]
     options = ["--annotations", "-n", "0", "-q", "-p", "no:cacheprovider", "-m", ""]
-    options += ["-k", "([pair] and not suggest) or floor_that"]
+    options += ["-k", "([pair] and not suggest) or as_many_contacts_stick"]
     files = ["tests/machines/test_verbs.py", "tests/machine/test_contacts.py"]
     process = subprocess.run(
         [sys.executable, "-m", "pytest", *options, *files],
