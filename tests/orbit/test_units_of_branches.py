@@ -69,8 +69,8 @@ def test_errors_of_methods_are_the_same_in_all_units():
 
 
 class Uncoupled(vi.Mechanical):
-    """Two bodies without a spring between them. The first coordinate has a unit of its own; the
-    second body touches a stop, and stays 1e-4 away from another one."""
+    """Two bodies without a spring between them. The coordinate of the first one has another unit.
+    The second one touches a stop, and stays 1e-4 away from another stop."""
 
     q = ("y", "x")
     cycle = 2 * np.pi / OMEGA

@@ -167,7 +167,8 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
     if released:
         given = lane._replace(state=new, modes=modes)
         modes, (any_event, kept), value = _after_friction(plan, given, released, value)
-        settled = None if len(released) == len(numbers) else any_event, kept
+        only_frictions = len(released) == len(numbers)
+        settled = (None if only_frictions else any_event), kept
     clock = plan.clock(lane.s, old)
     lane = lane.log_event(taken & happens, clock, kind, logged_number, value)
     lane = _update_after(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
