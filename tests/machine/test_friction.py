@@ -274,6 +274,35 @@ def test_frictions_on_one_velocity_add():
         vi.simulate(Opposite(), vi.State(x=0.1, u=0.0), 1)
 
 
+class Clutches(vi.Mechanical):
+    """Three bodies, each rubbing on the next: the first pair from t = 0.4 on, the second without
+    load."""
+
+    q = ("b", "c", "d")
+    mass = (1.0, 1.0, 1.0)
+    cycle = 1.0
+    contacts = (
+        vi.DryFriction(
+            0.5, on=lambda q: q.c - q.b, load=lambda t, z: jnp.where(t < 0.4, 0.0, 20.0)
+        ),
+        vi.DryFriction(0.5, on=lambda q: q.d - q.c, load=lambda t, z: 0.0 * t),
+    )
+
+    def force(self, t, q, v):
+        return dict(b=0.0, c=0.0, d=0.0)
+
+
+def test_friction_without_load_logs_only_changes():
+    """A body of speed 10 is braked by 10, the next one sped up by 10, until both have speed 5."""
+    machine = Clutches()
+    run = vi.simulate(machine, machine.at(v=dict(b=10.0)), 1, event_log=8)
+    log = run.event_log
+    np.testing.assert_allclose(log.phase[0, :2], [0.4, 0.9], rtol=0, atol=1e-9)
+    assert log.number[0, :3].tolist() == [1, 0, -1]
+    assert log.value[0, :2].tolist() == [-1, 0]  # the second slips, the first sticks
+    np.testing.assert_allclose([run.last.c, run.last.d], [1.75, 0.0], rtol=0, atol=1e-8)
+
+
 class Pressed(vi.AbstractMachine):
     """A load that swings slowly presses a body, which friction brakes, on its stop."""
 

@@ -163,14 +163,19 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
         if len(numbers) > 1:
             its_entry = select(here, its_entry, (kind, logged_number, value))
         (kind, logged_number, value), happens = its_entry, happens | here
-    settled = None
+    settled, logged = None, happens
     if released:
         given = lane._replace(state=new, modes=modes)
-        modes, (any_event, kept), value = _after_friction(plan, given, released, value)
+        modes, (any_event, kept) = _after_friction(plan, given, released)
+        for i, (_, here) in released.items():
+            mode, old_mode = _slips(modes[i]), _slips(modes_before[i])
+            value = jnp.where(here, mode, value)
+            # A force that jumps within a step may seem to pass its bound before the jump.
+            logged = logged & ~(here & (mode == old_mode))
         only_frictions = len(released) == len(numbers)
         settled = (None if only_frictions else any_event), kept
     clock = plan.clock(lane.s, old)
-    lane = lane.log_event(taken & happens, clock, kind, logged_number, value)
+    lane = lane.log_event(taken & logged, clock, kind, logged_number, value)
     lane = _update_after(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
     lane = release_pulled(plan, lane, taken, happens, (old, modes_before), settled=settled)
     triggered, near, before = {}, x.near, (old, modes_before)
@@ -188,11 +193,11 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
 
 
 def _after_friction(
-    plan: Plan, lane: Lane, events: dict[int, tuple[Flag, Flag]], value: Scalar | float
-) -> tuple[Scalars, tuple[Flag, Scalars], Scalar]:
-    """Return the modes after an event of a friction, whether one happened and the contacts then,
-    and the new mode for the log; without one those of the lane and `value`. `events`: for each
-    friction's mode, whether its force became too large, and whether its event happened."""
+    plan: Plan, lane: Lane, events: dict[int, tuple[Flag, Flag]]
+) -> tuple[Scalars, tuple[Flag, Scalars]]:
+    """Return the modes after an event of a friction, and whether one happened and the contacts
+    then; without one the modes of the lane. `events`: for each friction's mode, whether its force
+    became too large, and whether its event happened."""
     any_event = any_of(jnp.zeros((), bool), (here for _, here in events.values()))
     released = {i: when for i, (when, _) in events.items()}
 
@@ -207,11 +212,12 @@ def _after_friction(
 
     old = lane.modes, tuple(map(jnp.abs, contact))
     modes, kept = jax.lax.cond(any_event, settled, lambda: old)
-    found = jnp.asarray(value, lane.s.dtype)
-    for i, (_, here) in events.items():
-        held = jnp.where(jnp.abs(modes[i]) < 1, 0.0, modes[i])  # see `Friction`
-        found = jnp.where(here, held, found)
-    return modes, (any_event, kept), found
+    return modes, (any_event, kept)
+
+
+def _slips(mode: Scalar) -> Scalar:
+    """Return the direction in which a friction slips, 0 if it sticks: see `Friction`."""
+    return jnp.where(jnp.abs(mode) < 1, 0.0, mode)
 
 
 def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, here: Flag) -> Lane:
