@@ -155,7 +155,7 @@ def test_rounding_of_a_number_at_rest_is_not_its_size():
     for tilt, size in ((0.0, 1.0), (1e-17, 1.0), (1e-3, 1e-3)):
         start = jax.tree.map(jnp.asarray, machine.at(x=0.5, tilt=tilt))
         sizes = sizes_of(machine, zero, start, ())
-        assert sizes is not None and float(sizes.tilt) == size
+        assert float(sizes.tilt) == size
 
 
 @pytest.mark.parametrize("creep", [0.0, 1e-12])

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array
 
@@ -18,6 +17,7 @@ from ..machine import (
     outcomes_of,
     prepared,
     replaced,
+    scales_known,
     without_modes,
 )
 from ._step.hybrid import iterate
@@ -34,7 +34,7 @@ from .machine_checks import (
 from .noise import in_modes_of
 from .plan import Plan
 from .results import code
-from .sizes import extents_of, limited_size, sizes_of
+from .sizes import sizes_at_start
 
 
 def _is_active(plan: Plan, lane: Lane) -> Flag:
@@ -75,14 +75,12 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
         zero = jnp.zeros_like(plan.machine.position(start))
     s = zero if plan.begin is None else zero + plan.begin
     check_before_modes(plan.machine, s, start)
-    modes = begin_modes(plan.machine, s, start, plan.start_modes)
+    modes = begin_modes(plan.machine, s, start, plan.start_modes, settles=False)
     check_field(plan.machine, s, start, modes)
     check_laws(plan.machine, zero)
     check_events(plan.machine, s, start, modes)
-    sizes = sizes_of(plan.machine, s, start, modes)
-    if sizes is not None:
-        extents = extents_of(plan, s, start, modes, sizes)
-        sizes = jtu.tree_map(limited_size, sizes)
+    if not scales_known(plan.machine):
+        modes, sizes, extents = sizes_at_start(plan, s, start)
         method = plan.method.with_sizes(sizes)
         plan = dataclasses.replace(plan, method=method, sizes=sizes, extents=extents)
         if plan.memory is not None:

@@ -14,14 +14,13 @@ from ..machine import (
     at_stop,
     clock_of,
     events_of,
+    events_of_steps,
     is_autonomous,
     is_compound,
     limited_in,
     mode_number,
     others_of,
     own_modes,
-    section_in,
-    section_number,
     stops_of,
     switches_of,
     with_modes,
@@ -186,8 +185,7 @@ class Plan(eqx.Module):
 
     def others(self, state: State) -> list[int]:
         """Return the numbers of the events, other than stops, whose guards each step checks."""
-        last = section_number(self.machine) + (section_in(self.machine, state) is not None)
-        return list(range(len(stops_of(self.machine)), last))
+        return events_of_steps(self.machine, state)
 
     def from_below(self, state: State) -> list[int]:
         """Return those of `others` that happen only from below (see `AbstractEvent.from_below`)."""

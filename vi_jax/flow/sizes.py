@@ -6,6 +6,7 @@ size. Thresholds in `s` are in a unit of `s` that follows the cycle.
 """
 
 from collections.abc import Callable
+from functools import partial
 from math import pi
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
 from jaxtyping import Array
 
+from .. import lanes
 from .._programs import compiled
 from .._types import Scalar, Scalars, State, Vector
 from ..machine import (
@@ -26,6 +28,7 @@ from ..machine import (
     angles_in,
     begin_modes,
     events_of,
+    events_of_steps,
     guard_of,
     in_rows,
     longest_step,
@@ -68,16 +71,32 @@ _GROWS, _INSTANTS = 1e-3, 7
 _ZERO = 1e-15
 
 
-def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) -> State | None:
-    """Return the expected size of each number of the state. `None` for a machine whose numbers are
-    about 1 by definition.
+def sizes_at_start(plan: "Plan", s: Scalar, start: State) -> tuple[Scalars, State, tuple[Any, ...]]:
+    """Return the modes at the start, `Plan.sizes` and `Plan.extents`, by a kernel that all plans of
+    a machine share."""
+    numbers, rest = eqx.partition(plan.machine, eqx.is_array)
+    given = stop_gradient((numbers, s, start, plan.start_modes))
+    return lanes.once(partial(_sizes_at_start, rest, plan.rests), given, backend=plan.backend)
+
+
+def _sizes_at_start(
+    rest: AbstractMachine, rests: bool, inputs: tuple[AbstractMachine, Scalar, State, Any]
+) -> tuple[Scalars, State, tuple[Any, ...]]:
+    numbers, s, start, own = inputs
+    machine = eqx.combine(numbers, rest)
+    modes = begin_modes(machine, s, start, own)
+    sizes = sizes_of(machine, s, start, modes)
+    extents = extents_of(machine, s, start, modes, sizes, rests=rests)
+    return modes, jtu.tree_map(limited_size, sizes), extents
+
+
+def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) -> State:
+    """Return the expected size of each number of the state.
 
     The size is the greater of the value at the start and its change at the rates there, in 1/2π of
     a cycle or of a shorter natural period. If both are tiny, it is the change that the sizes of the
     other numbers cause. The size of a zero that nothing moves yet is unknown, and returned as 1.
     """
-    if scales_known(machine):
-        return None
     known = _known_sizes(machine, s, start, modes, jtu.tree_map(jnp.abs, start))
     return stop_gradient(jtu.tree_map(_known_or_one, known))
 
@@ -92,15 +111,23 @@ def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None)
     row, unravel = ravel_pytree(stop_gradient(state))
     if scales_known(machine):
         return jnp.ones_like(row)
-    zero, angles = jnp.zeros((), row.dtype), angles_in(machine, state)
+    angles = angles_in(machine, state)
     angles = jnp.zeros(row.shape, bool) if angles is None else angles
-    modes = begin_modes(machine, zero, state, modes_of(start))
     values = unravel(jnp.where(angles, 1.0, jnp.abs(row)))
-    sizes = in_rows(_known_sizes(machine, zero, state, modes, values), 0)
+    numbers, rest = eqx.partition(machine, eqx.is_array)
+    given = stop_gradient((numbers, state, modes_of(start), values))
+    sizes = lanes.once(partial(_row_sizes, rest), given)
     if rows is not None:
         rows = stop_gradient(jnp.nan_to_num(jnp.abs(rows.reshape(-1, row.size)), posinf=0.0))
         sizes = jnp.maximum(sizes, jnp.max(rows, axis=0))
     return stop_gradient(jnp.where(angles | ~(sizes > _ZERO), 1.0, sizes))
+
+
+def _row_sizes(rest: AbstractMachine, inputs: tuple[AbstractMachine, State, Any, State]) -> Vector:
+    numbers, state, own, values = inputs
+    machine, zero = eqx.combine(numbers, rest), jnp.zeros((), in_rows(values, 0).dtype)
+    modes = begin_modes(machine, zero, state, own)
+    return in_rows(_known_sizes(machine, zero, state, modes, values), 0)
 
 
 _compiled_sizes = compiled(row_sizes)
@@ -164,12 +191,12 @@ def _with_slip(
 
 
 def extents_of(
-    plan: "Plan", s: Scalar, start: State, modes: Scalars, sizes: State
+    machine: AbstractMachine, s: Scalar, start: State, modes: Scalars, sizes: State, *, rests: bool
 ) -> tuple[Any, ...]:
     """Return `Plan.extents`: the `limited_size` of each coordinate, then the size of the guard of
     each event other than a stop. `sizes` are from `sizes_of`."""
-    machine, unit = plan.machine, plan.unit
-    contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates) if plan.rests else ()
+    unit = unit_of(machine)
+    contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates) if rests else ()
     s, start = stop_gradient((s, start))
 
     def of_guard(number: int, modes: Scalars, contact: Scalars) -> Scalar:
@@ -182,7 +209,7 @@ def extents_of(
 
     of_coordinates = (size_of(x.position, start, sizes) for x in machine.coordinates)
     extents: list[Any] = [limited_size(_known_or_one(size)) for size in of_coordinates]
-    for number in plan.others(start):
+    for number in events_of_steps(machine, start):
         event, rest = events_of(machine)[number], contact
         if not event.holds_mode:
             extents.append(of_guard(number, modes, rest))

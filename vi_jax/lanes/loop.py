@@ -93,10 +93,11 @@ def run(
     return results, row
 
 
-def once(function: Callable[[Any], Any], inputs: object) -> Any:
+def once(function: Callable[[Any], Any], inputs: object, *, backend: str | None = None) -> Any:
     """Run `function(inputs)` as vector code without a loop, on a pytree of scalars and small
     arrays. `vmap` batches it like `run`."""
-    return run(_begin_ended, _no_step, functools.partial(_end_with, function), inputs, rows=0)[0]
+    end = functools.partial(_end_with, function)
+    return run(_begin_ended, _no_step, end, inputs, rows=0, backend=backend)[0]
 
 
 def _begin_ended(inputs: object) -> tuple[Any, Emitted]:

@@ -30,8 +30,9 @@ from .delay import (
 from .delay_chain import delay_chain, history_in, machine_of_chain, without_history
 from .event import AbstractEvent, AbstractSwitch
 from .events import (
-    Reset, Switch, after_event, begin_modes, event_of, guard_of, has_contact_friction,
-    holds_anywhere, is_autonomous, is_compound, jump_of, section_number, sides_of, struck_modes,
+    Reset, Switch, after_event, begin_modes, event_of, events_of_steps, guard_of,
+    has_contact_friction, holds_anywhere, is_autonomous, is_compound, jump_of, section_number,
+    sides_of, struck_modes,
 )
 from .friction import (
     ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_contacts, settled_modes,

@@ -28,6 +28,7 @@ from .parts import (
     friction_on,
     limited_in,
     mode_number,
+    section_in,
     stops_of,
     switches_of,
 )
@@ -45,6 +46,12 @@ def is_autonomous(machine: Machine, state: State) -> bool:
 def section_number(machine: Machine) -> int:
     """Return the number of the section, the last of the machine's events."""
     return len(events_of(machine)) - 1
+
+
+def events_of_steps(machine: Machine, state: State) -> list[int]:
+    """Return the numbers of the events, other than stops, whose guards each step checks."""
+    last = section_number(machine) + (section_in(machine, state) is not None)
+    return list(range(len(stops_of(machine)), last))
 
 
 def guard_of(
