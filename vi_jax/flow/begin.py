@@ -41,7 +41,9 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     bad = jax.lax.stop_gradient(bad)
     zero = jnp.zeros_like(Y)
     s = zero if plan.begin is None else zero + plan.begin
-    modes = begin_modes(machine, s, start, plan.start_modes)
+    modes = plan.first_modes
+    if modes is None:
+        modes = begin_modes(machine, s, start, plan.start_modes)
     free = in_modes(machine, modes)
     current = [rates(free.field, x, s, start) for x in machine.coordinates]
     # At rest the sign of the acceleration is the direction of motion.

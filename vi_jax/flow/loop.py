@@ -83,7 +83,9 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
         modes, sizes, extents = sizes_at_start(plan, s, start)
         method = plan.method.with_sizes(sizes)
         plan = dataclasses.replace(plan, method=method, sizes=sizes, extents=extents)
-        if plan.memory is not None:
+        if plan.memory is None:
+            plan = dataclasses.replace(plan, first_modes=modes)
+        else:
             plan = with_sizes(plan, s, start, modes)
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(

@@ -95,6 +95,8 @@ class Plan(eqx.Module):
     """Clock at which the only cycle ends, if it is not the end of the machine's cycle."""
     start_modes: Scalars | None = None
     """The machine's own modes at the start, if the start contains them."""
+    first_modes: Scalars | None = None
+    """All modes at the start (see `sizes.sizes_at_start`); `None` if they are not known yet."""
     stop: Any = None
     """A condition that ends a lane early (see `RunOptions`); the rest of its record is NaN."""
     constant_records: bool = eqx.field(static=True, default=False)
