@@ -216,7 +216,8 @@ def kernel_of(program: AnyProgram, lanes: int, one_for_all: tuple[bool, ...] = (
     bits = _register_bits(cpu)
     width = _width(program, lanes, bits)
     derived = isinstance(program, ReverseProgram) or any(program.tangents)
-    passes = not derived or lanes > _FEW_LANES
+    # What is computed once, such as the sizes at the start, takes LLVM longer than it runs.
+    passes = bool(program.carry_avals) and (not derived or lanes > _FEW_LANES)
     with _lock:
         keys = _keys.setdefault(program, {})
         kernel = _in_use.get(keys.get((cpu, passes, width, one_for_all), -1))
