@@ -51,6 +51,24 @@ def test_results_are_the_same_bits_in_fewer_equations():
     assert merged(found) is not found and size_of(merged(found).jaxpr) == size_of(found.jaxpr)
 
 
+def test_arithmetic_with_known_numbers_is_done():
+    @jax.jit
+    def part(x, mass):
+        return x / mass, -(2.0 * jnp.ones_like(x)) / 3.0, jnp.sin(x), jnp.cos(x), jnp.exp(x)
+
+    def function(x):
+        y, third, sine, *_ = part(1.0 * x, 1.0)
+        return y - 0.0, third * third, (sine + third) * 1.0, 0.0 * x, jnp.float32(third) - 1.0
+
+    closed = jax.make_jaxpr(function)(0.1)
+    found = merged(closed)
+    for x in (0.3, -0.0, np.inf, np.nan):
+        for a, b in zip(evaluated(closed, x), evaluated(found, x), strict=True):
+            assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
+    flat = names(found.jaxpr)
+    assert flat.count("mul") == 1 and "sub" not in flat  # a product with 0 may be NaN
+
+
 def test_derivatives_are_the_same():
     @jax.custom_jvp
     def own(x):

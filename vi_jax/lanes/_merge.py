@@ -1,12 +1,12 @@
 """Merging equal equations of a jaxpr, so that each is differentiated and written once.
 
 JAX traces what a function writes: the sine of an angle in the mass matrix, in its derivative and in
-the force becomes three equations.
+the force becomes three equations, and a mass of 1 a division by 1.
 """
 
 import copy
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,19 @@ from ._program import with_mapped_bodies
 _SMALL = 8
 
 
+# Operations on known numbers that are done here, as a processor would: NumPy's rounding is the same.
+_KNOWN: dict[str, Callable[..., Any]] = {
+    "neg": np.negative, "add": np.add, "sub": np.subtract, "mul": np.multiply,
+    "quotient": np.divide, "abs": np.abs, "max": np.maximum, "min": np.minimum, "gt": np.greater,
+    "lt": np.less, "ge": np.greater_equal, "le": np.less_equal, "eq": np.equal,
+    "ne": np.not_equal, "convert_element_type": lambda x: x, "stop_gradient": lambda x: x,
+}  # fmt: skip
+
+
 def merged(*jaxprs: ClosedJaxpr) -> list[ClosedJaxpr]:
     """Return jaxprs with the same results, in each of which no two equations are equal and each is
-    needed; their inner jaxprs too. Small calls are inlined. Floating-point divisions become
-    quotients, which have a better derivative."""
+    needed; their inner jaxprs too. Small calls are inlined, and arithmetic with known numbers is
+    done. Floating-point divisions become quotients, which have a better derivative."""
     merger = _Merger()
     return [merger.closed(x) for x in jaxprs]
 
@@ -64,14 +73,18 @@ class _Writer:
 
         for eqn in eqns:
             given = [read(a) for a in eqn.invars]
-            body = _small_body(eqn)
-            if body is not None:
-                body = self._merger.open(body)
+            body = _body(eqn)
+            body = None if body is None else self._merger.open(body)
+            if body is not None and len(body.eqns) <= _SMALL:
                 arguments = dict(zip(body.invars, given, strict=True))
                 outs = self.append(body.eqns, arguments, body.outvars, inlined=True)
             else:
                 eqn = with_mapped_bodies(as_quotient(eqn), self._merger.closed, self._merger.open)
-                outs = self._one(eqn.replace(invars=given), inlined)
+                found = _without_arithmetic(eqn, given)
+                outs = self._one(eqn.replace(invars=given), inlined) if found is None else [found]
+                if body is not None:
+                    pairs = zip(outs, body.outvars, strict=True)
+                    outs = [x if isinstance(x, Literal) else out for out, x in pairs]
             known.update(zip(eqn.outvars, outs, strict=True))
         return [read(a) for a in results]
 
@@ -90,14 +103,31 @@ class _Writer:
         return eqn.outvars
 
 
-def _small_body(eqn: Any) -> Jaxpr | None:
-    """Return the body of a call that is written inline; `None` for other equations."""
+def _without_arithmetic(eqn: Any, given: Sequence[Any]) -> Any:
+    """Return the result of an equation with known numbers, or of one that returns its argument (a
+    number times 1, for example); `None` for other equations."""
+    name, numbers = eqn.primitive.name, [x for x in given if isinstance(x, Literal)]
+    if name not in _KNOWN or not numbers or eqn.outvars[0].aval.shape:
+        return None
+    aval = eqn.outvars[0].aval
+    if len(numbers) == len(given):
+        with np.errstate(all="ignore"):
+            known = _KNOWN[name](*(np.asarray(x.val, x.aval.dtype) for x in numbers))
+        return Literal(known.astype(aval.dtype)[()], aval)
+    first, last = given[0], given[-1]
+    if name == "mul" and isinstance(first, Literal):
+        first, last = last, first
+    same = {"mul": 1.0, "quotient": 1.0, "sub": 0.0}.get(name)
+    is_same = isinstance(last, Literal) and last.val == same and first.aval == aval
+    return first if is_same else None
+
+
+def _body(eqn: Any) -> Jaxpr | None:
+    """Return the body of a call that may be written inline; `None` for other equations."""
     if eqn.primitive.name != "jit":
         return None
     closed = eqn.params["jaxpr"]
-    if closed.consts or len(closed.jaxpr.eqns) > _SMALL or closed.effects:
-        return None
-    return closed.jaxpr
+    return None if closed.consts or closed.effects else closed.jaxpr
 
 
 def _key(eqn: Any) -> Any:
