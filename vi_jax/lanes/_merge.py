@@ -20,7 +20,7 @@ from ._program import with_mapped_bodies
 _SMALL = 8
 
 
-# Operations on known numbers that are done here, as a processor would: NumPy's rounding is the same.
+# Operations on known numbers that are done here. NumPy rounds as a processor does.
 _KNOWN: dict[str, Callable[..., Any]] = {
     "neg": np.negative, "add": np.add, "sub": np.subtract, "mul": np.multiply,
     "quotient": np.divide, "abs": np.abs, "max": np.maximum, "min": np.minimum, "gt": np.greater,
