@@ -284,9 +284,9 @@ def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
     return list(outs)
 
 
-# A part that is called more than once becomes a function if it has at least so many operations. A
-# choice: a call of 20 vectors costs about as much as 10 operations, and a field of 80 that was
-# written inline at its 24 calls ran 7 % slower.
+# A part that is called more than once becomes a function if it has at least so many operations, and
+# more than arguments and results. Choices: a call of 20 vectors costs about as much as 10
+# operations, and a field of 80 that was written inline at its 24 calls ran 7 % slower.
 _LEAST_FUNCTION = 50
 
 
@@ -304,6 +304,7 @@ class Functions:
 
     def __init__(self, jaxprs: Sequence[ClosedJaxpr | Jaxpr]):
         self.texts: list[str] = []
+        self._types: dict[str, str] = {}
         self._calls: dict[int, int] = {}
         self._found: dict[tuple, _Function | None] = {}
         for jaxpr in jaxprs:
@@ -328,7 +329,8 @@ class Functions:
             return None
         key = id(jaxpr), *((x.shape, x.kind) for x in args)
         if key not in self._found:
-            is_large = size_of(jaxpr) >= _LEAST_FUNCTION
+            vectors = sum(shape_of(v.aval).size for v in (*jaxpr.invars, *jaxpr.outvars))
+            is_large = size_of(jaxpr) >= max(_LEAST_FUNCTION, vectors)
             self._found[key] = self._written(t, closed, args) if is_large else None
         found = self._found[key]
         if found is None:
@@ -362,7 +364,7 @@ class Functions:
         if not all(isinstance(x, Registers) for x in results):
             return None
         shapes = [(x.shape, x.kind) for x in results]
-        found = _Function(f"part{len(self.texts)}", shapes, own.arena.size)
+        found = _Function(f"part{len(self._found)}", shapes, own.arena.size)
         kind, name = self._type(t, found.results), "poison"
         for i, x in enumerate(_flat(results)):
             name = own.raw(f"insertvalue {kind} {name}, {t.vector(x.kind)} {x.text}, {i}")
@@ -374,7 +376,12 @@ class Functions:
         return found
 
     def _type(self, t: Text, results: list[tuple[tuple[int, ...], str]]) -> str:
-        return "{ " + ", ".join(t.vector(kind) for kind in _numbers(results)) + " }"
+        """Return the name of the type of some results: each use would repeat all vectors."""
+        text = "{ " + ", ".join(t.vector(kind) for kind in _numbers(results)) + " }"
+        if text not in self._types:
+            self._types[text] = name = f"%results{len(self._types)}"
+            self.texts.insert(0, f"{name} = type {text}")
+        return self._types[text]
 
 
 def _numbers(results: list[tuple[tuple[int, ...], str]]) -> list[str]:
