@@ -36,6 +36,7 @@ from ..machine import (
     modes_of,
     push_of,
     scales_known,
+    size_by,
     size_of,
     stops_of,
     with_some_past,
@@ -203,9 +204,9 @@ def extents_of(
         def guard(s: Scalar, x: State) -> Scalar:
             return jnp.asarray(guard_of(machine, number, s, x, modes, contact), s.dtype)
 
-        value, rate = jax.jvp(lambda s: guard(s, start), (s,), (jnp.ones_like(s),))
+        value, (rate, slopes) = jax.value_and_grad(guard, (0, 1))(s, start)
         size = jnp.maximum(jnp.abs(value), unit * jnp.abs(rate))
-        return _known_or_one(jnp.maximum(size, size_of(lambda x: guard(s, x), start, sizes)))
+        return _known_or_one(jnp.maximum(size, size_by(slopes, sizes)))
 
     of_coordinates = (size_of(x.position, start, sizes) for x in machine.coordinates)
     extents: list[Any] = [limited_size(_known_or_one(size)) for size in of_coordinates]

@@ -40,7 +40,7 @@ from .friction import (
 )
 from .leaves import (
     by_name, check_again, check_leaf, check_name, components, first_few, in_rows, leaf, leaf_names,
-    near_names, size_of, with_leaf, with_leaves,
+    near_names, size_by, size_of, with_leaf, with_leaves,
 )
 from .mechanical import Mechanical, solved
 from .modes import (

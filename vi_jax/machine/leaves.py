@@ -46,7 +46,11 @@ def in_rows(states: State, lead: int = 1) -> Array:
 
 def size_of(part: Callable[[State], Scalar], state: State, sizes: State) -> Scalar:
     """Return the sum over the state of |∂part/∂x| times the size of x."""
-    slopes = jax.grad(lambda x: jnp.sum(part(x)))(state)
+    return size_by(jax.grad(lambda x: jnp.sum(part(x)))(state), sizes)
+
+
+def size_by(slopes: State, sizes: State) -> Scalar:
+    """Return the sum of |slope| times the size of its number."""
     each = jtu.tree_map(lambda slope, size: jnp.sum(jnp.abs(slope) * size), slopes, sizes)
     return sum(jtu.tree_leaves(each), start=jnp.zeros(()))
 
