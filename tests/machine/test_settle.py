@@ -6,7 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vi_jax.machine.settle import Contacts, Strike, settle, strike
+from vi_jax.machine.settle import (
+    Contacts,
+    Strike,
+    _decide_dry,
+    _decide_in_turn,
+    settle,
+    strike,
+)
 
 N, D = 4, 2
 """All questions are padded to four contacts with friction and two dry frictions, in batches of 240,
@@ -119,6 +126,35 @@ def test_random_questions_are_answered(count):
     assert 0 < unsolved < count / 10
     # Lemke's method may end in a ray although a solution exists.
     assert lost <= 0.01 * count
+
+
+def random_frictions(rng, number):
+    """Return a question of three dry frictions; in every fourth the rows are dependent."""
+    rows = rng.normal(size=(3, 4))
+    rows[2] = rows[1] - rows[0] if number % 4 == 0 else rows[2]
+    gains, force = rows @ rows.T, rng.normal(size=4)
+    slip = rng.choice([-1.0, 0, 0, 0, 1.0], 3)
+    hold = rng.choice([1.0, 1.0, 1.3, 1 - 1e-6], 3)
+    level = rng.uniform(size=3) * rng.choice([0, 0.3, 3, 30])
+    return Contacts(
+        gains, rows @ force, np.zeros(0), np.zeros(0, bool), slip, level, hold
+    )  # fmt: skip
+
+
+def test_dry_frictions_alone_settle_as_by_lemkes_method():
+    rng = np.random.default_rng(1)
+    questions = [random_frictions(rng, i) for i in range(4800)]
+    both = jax.jit(jax.vmap(lambda x: (_decide_dry(x), _decide_in_turn(x, (), True))))
+    found, expected = (
+        jax.tree.map(lambda *x: np.stack(x), *answers)
+        for answers in zip(*each(both, questions), strict=True)
+    )
+    np.testing.assert_array_equal(found.code, expected.code)
+    np.testing.assert_array_equal(found.holds, expected.holds)
+    np.testing.assert_array_equal(found.mode, expected.mode)
+    np.testing.assert_allclose(found.force, expected.force, rtol=0, atol=1e-9)
+    sticks, begins = found.holds, (found.mode != 0) & (np.stack([x.slip for x in questions]) == 0)
+    assert (begins.sum(1) == 1).sum() > 200 and sticks.all(1).sum() > 200  # both happen
 
 
 def test_random_impacts_keep_the_conditions():
