@@ -111,7 +111,8 @@ class PressedByItsCycle(vi.AbstractMachine):
 
 
 def test_a_body_at_rest_at_an_equilibrium_is_no_orbit():
-    """Regression: the force on its stop counted as motion, and the rounding around it was an orbit."""
+    """Regression: the force on its stop counted as motion, so rounding was an orbit. The other
+    motion has the period of the van der Pol oscillator."""
     pressed = PressedByItsCycle()
     still, moving = (vi.find_orbit(pressed, vi.State(x=0.0, v=0.0, y=0.0, w=w)) for w in (0.1, 2.0))
     assert still.result == vi.ORBIT_RESULTS.equilibrium
