@@ -204,6 +204,21 @@ def test_invalid_states_raise():
     with pytest.raises(ValueError, match=r"`start` must be one state .* shape \(5,\)"):
         vi.simulate(Apart(Numbers), many, 3)
 
+    class Plain(vi.AbstractMachine):
+        cycle = 1.0
+
+        def field(self, t, z):
+            return {"x": -z.x}
+
+    three = vi.State(x=jnp.ones(3))
+    with pytest.raises(ValueError, match=r"`def position\(self, z\): return z.x\[0\]` in a Plain"):
+        vi.simulate(Plain(), three, 1)
+
+    class Cured(Plain):
+        position = velocity = lambda self, z: z.x[0]
+
+    np.testing.assert_allclose(vi.simulate(Cured(), three, 1).last.x, np.exp(-1), rtol=1e-12)
+
 
 MASSES = 18
 METHOD = vi.FixedStep(steps_per_cycle=40)

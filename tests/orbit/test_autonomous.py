@@ -98,3 +98,22 @@ def test_a_branch_ends_near_a_homoclinic_motion():
     branch = vi.continue_orbit(orbit, parameter="slope", bounds=(0.02, 0.2))
     assert branch.ends == ("long", "bounds") and 0.0289 < branch.parameter.min() < 0.03
     np.testing.assert_allclose(np.abs(branch.multipliers[:, 0]), MULTIPLIER, atol=1e-10)
+
+
+class PressedByItsCycle(vi.AbstractMachine):
+    """A limit cycle whose y presses x on a stop."""
+
+    cycle = vi.rising("y", usual=6.3)
+    contacts = vi.RigidStop(0.0, 0.5, on=("x", "v"))
+
+    def field(self, t, z):
+        return {"x": z.v, "v": 3 - 0.1 * z.v + 0.2 * z.y, "y": z.w, "w": (1 - z.y**2) * z.w - z.y}
+
+
+def test_a_body_at_rest_at_an_equilibrium_is_no_orbit():
+    """Regression: the force on its stop counted as motion, so rounding was an orbit. The other
+    motion has the period of the van der Pol oscillator."""
+    pressed = PressedByItsCycle()
+    still, moving = (vi.find_orbit(pressed, vi.State(x=0.0, v=0.0, y=0.0, w=w)) for w in (0.1, 2.0))
+    assert still.result == vi.ORBIT_RESULTS.equilibrium
+    assert bool(moving.successful) and float(moving.duration) == pytest.approx(6.6632868593)

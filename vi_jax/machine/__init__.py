@@ -13,7 +13,7 @@ from .clocks import (
     cycles_in_words, frequency_ratio, in_clock, in_cycle_clock, in_cycle_state, is_alive,
     is_in_range, logged_turn, may_rest, observed_later, phase_at, prepared, scales_known,
 )
-from .contact_forces import contact_forces
+from .contact_forces import closed_contacts, contact_forces
 from .contacts import (
     Impact, added, check_takes, constrained_rate, contact_constraints, field_in, forces, impact_on,
     on_held_surfaces, push_gains, push_of, row_of, shown_modes, velocity_change,

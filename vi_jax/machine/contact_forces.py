@@ -41,7 +41,7 @@ def contact_forces(machine: Any, state: State, t: Any = 0.0) -> dict[str, Named]
     own, state = modes_of(state), jtu.tree_map(lambda x: 1.0 * jnp.asarray(x), without_modes(state))
     s = jnp.asarray(t, float)
     modes = begin_modes(machine, s, state, own)
-    contact, slips, holds = _closed(machine, s, state, modes)
+    contact, slips, holds = closed_contacts(machine, s, state, modes)
     found: dict[str, Named] = {}
     stops, switches = stops_of(machine), switches_of(machine)
     order, force = [], jnp.zeros((0,))
@@ -70,7 +70,7 @@ def contact_forces(machine: Any, state: State, t: Any = 0.0) -> dict[str, Named]
     return found
 
 
-def _closed(machine: Machine, s: Scalar, state: State, modes: Any) -> tuple[Any, Any, Any]:
+def closed_contacts(machine: Machine, s: Scalar, state: State, modes: Any) -> tuple[Any, Any, Any]:
     """Return the closed contacts, as in `EventContext`, and for each friction its slip and the
     greatest force without slip relative to that of a slipping body."""
     indices, switches = frictions_in(machine), switches_of(machine)

@@ -300,8 +300,8 @@ def boundary(
         several = ""
         if point.kind in TOUCHING and sum(point.step.observed.lost) > 1:
             several = (
-                " Several of its events vanish at once, as in a motion that repeats within its "
-                "period. Begin with the motion of fewer cycles."
+                " Several of its events vanish at once, as in a symmetric motion, or in one that "
+                "repeats within its period. Break the symmetry, or begin with fewer cycles."
             )
         raise ValueError(
             "Argument `point` could not be refined in two parameters (last correction "

@@ -21,11 +21,12 @@ from jaxtyping import Array, Bool, Float, Int
 from .._checks import count, flag
 from .._messages import warning_once
 from .._programs import compiled
-from .._types import Flag, Number, Scalar, State, Vector
+from .._types import Flag, Number, Scalar, Scalars, State, Vector
 from ..flow import (
     ExactFlight,
     MethodLike,
     Run,
+    SmoothMachine,
     check_leaves,
     in_modes,
     means,
@@ -40,6 +41,7 @@ from ..machine import (
     HybridState,
     angles_in,
     begin_modes,
+    closed_contacts,
     frequency_ratio,
     in_rows,
     is_autonomous,
@@ -47,8 +49,10 @@ from ..machine import (
     nearest_images,
     observed_later,
     phase_at,
+    pressed_contacts,
     raveled,
     replaced,
+    stops_of,
     with_modes,
     without_modes,
 )
@@ -618,9 +622,17 @@ def is_equilibrium(machine: AbstractMachine, state: State, duration: Any, unit: 
         return jnp.zeros((), bool)
     x = ravel_pytree(state)[0]
     s = jnp.zeros((), x.dtype)
-    field = in_modes(machine, begin_modes(machine, s, state, machine_modes)).field
-    moved = jnp.abs(ravel_pytree(field(s, state))[0]) * duration
-    return jnp.all(moved <= _state_tolerance(x.dtype) * (unit + jnp.abs(x)))
+    modes = begin_modes(machine, s, state, machine_modes)
+    moved = jnp.abs(ravel_pytree(_with_rests(machine, s, state, modes).field(s, state))[0])
+    return jnp.all(moved * duration <= _state_tolerance(x.dtype) * (unit + jnp.abs(x)))
+
+
+def _with_rests(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> SmoothMachine:
+    """Return the machine with the bodies held that rest on a stop in this state."""
+    if not stops_of(machine):
+        return in_modes(machine, modes)
+    contact = closed_contacts(machine, s, state, modes)[0]
+    return SmoothMachine(machine, *pressed_contacts(machine, s, state, modes, contact))
 
 
 def _state_tolerance(dtype: object) -> float:
