@@ -17,10 +17,11 @@ from jax.core import ShapedArray
 from jax.extend.core import Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir, partial_eval
 
+from .._collection import without_collection
 from ._arrays import MOST_IN_REGISTERS
 from ._derivative import forward, widened
 from ._program import LaneProgram, batch_of, dependent_parts, shape_of
-from ._shared import set_within, without_collection
+from ._shared import set_within
 from ._vector import Unsupported
 from .call import header, register_handler
 from .runtime import AnyProgram, kernel_of
