@@ -17,14 +17,7 @@ from .from_orbit import check_parameter, with_parameters
 from .kinds import GRAZING, TORUS
 from .results import Orbit
 from .tolerances import LOCATED, ROUGHLY, SAME
-from .torus import (
-    MOST,
-    REORDERED,
-    Torus,
-    first_mode,
-    margins_of,
-    torus_of,
-)
+from .torus import MOST, REORDERED, Torus, first_mode, margins_of, torus_of
 from .torus_equations import Curve, Equations, Solved, angles_of, derivative, interpolated
 from .walk import BOUNDS, INTERRUPTED, SAME_CURVE, STALLED, check_walk
 

@@ -40,12 +40,7 @@ def final(task: Task, how: vi.AbstractMethod, theta: jax.Array, Y0: jax.Array) -
 
 
 def build(
-    task: Task,
-    kappas: np.ndarray,
-    *,
-    name: str,
-    number: float = 0.0,
-    jacobian: bool = False,
+    task: Task, kappas: np.ndarray, *, name: str, number: float = 0.0, jacobian: bool = False
 ) -> tuple[Run, float]:
     """Build the lanes in one process.
 
