@@ -161,9 +161,7 @@ _LITTLE = 0.25
 
 
 def _without_unused(eqn: Any, used: tuple[bool, ...]) -> Any:
-    """Return a call without the results that are not `used`, and without the arguments that only
-    they need: a derivative of a field is often wanted for one of its numbers. Other equations are
-    returned as they are."""
+    """Return a call without results that are not `used`, and arguments that only they need."""
     if eqn.primitive.name != "jit" or all(used):
         return eqn
     whole = eqn.params[CALLS["jit"]]
@@ -410,8 +408,7 @@ def _cond(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
 
 
 def _is_cheap(jaxpr: Jaxpr) -> bool:
-    """Return whether skipping a branch does not pay: it has few operations, or only constants, such
-    as zero cotangents of unused arguments."""
+    """Return whether skipping a branch does not pay: few operations, or only constants."""
     constant = (
         eqn.primitive.name == "broadcast_in_dim" and isinstance(eqn.invars[0], Literal)
         for eqn in jaxpr.eqns
