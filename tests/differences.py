@@ -29,12 +29,7 @@ def some(cases, *names):
 
 
 def check_derivatives(
-    last: Callable[..., Any],
-    at: Any,
-    *,
-    step: Any = 1e-5,
-    tolerance: float = 1e-6,
-    impacts: int,
+    last: Callable[..., Any], at: Any, *, step: Any = 1e-5, tolerance: float = 1e-6, impacts: int
 ) -> None:
     """Compare forward derivatives with central differences, and reverse with forward derivatives.
 

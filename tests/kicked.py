@@ -31,12 +31,6 @@ class Kicked(vi.AbstractMachine):
     def field(self, s, x):
         return tuple(0 * y for y in x)
 
-    def position(self, x):
-        return x[0]
-
-    def velocity(self, x):
-        return x[1]
-
 
 def at(*x):
     return tuple(jnp.asarray(y, float) for y in x)

@@ -102,10 +102,7 @@ class LinearTruth:
             top = expm(self.held(resting) * reach) @ z
             if self.depth(i, top) > 1e-13 and self.speed(i, top) > -1e-9:
                 found.append(
-                    (
-                        self.first_zero(resting, z, reach, lambda y, i=i: self.depth(i, y)),
-                        i,
-                    )
+                    (self.first_zero(resting, z, reach, lambda y, i=i: self.depth(i, y)), i)
                 )
         return min(found) if found else None
 

@@ -39,12 +39,6 @@ class Walker(vi.AbstractMachine):
             stance=x.turning, turning=falls, between=x.swinging, swinging=falls + pull
         )  # fmt: skip
 
-    def position(self, x):
-        return x.stance
-
-    def velocity(self, x):
-        return x.turning
-
     def step_limit(self, s, x):
         return 0.8
 
@@ -80,12 +74,6 @@ class StickSlip(vi.AbstractMachine):
         # u is zero while the base sticks; u' = -u there avoids a Floquet multiplier of 1.
         braked = jnp.where(slides > 0, -3.17 - 0.2 * force, -x.u)
         return dict(q=x.v, v=force + slides * (3.17 + 0.2 * force), u=braked)
-
-    def position(self, x):
-        return x.q
-
-    def velocity(self, x):
-        return x.v
 
 
 class Excited(vi.AbstractMachine):

@@ -5,7 +5,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from scipy.integrate import solve_ivp
+
+from event_by_event import followed
 
 SINCE = 0.3  # phase of the drive on the section
 
@@ -52,31 +53,25 @@ def on_both_sides(point, parameter, bounds, distance=0.01):
 
 def settled(omega, level, second, damping, cycles=10):
     """Return phase, position, mode before and after each event of the last cycle, by SciPy."""
+    mode, events, end = 0, [], 2 * np.pi * cycles
 
-    def drive(phase):
-        return np.cos(phase) + second * np.cos(2 * phase + 1)
+    def drive(s):
+        return np.cos(s + SINCE) + second * np.cos(2 * (s + SINCE) + 1)
 
-    def field(phase, x):
-        force = drive(phase) - x[0] - damping * x[1]
+    def field(s, x):
+        force = drive(s) - x[0] - damping * x[1]
         held = 0.0 if mode == 0 else 1.0
         return [x[1] / omega, held * (force - mode * level) / omega]
 
-    def changes(phase, x):
-        return abs(drive(phase) - x[0]) - level if mode == 0 else -mode * x[1]
+    def changes(s, x):
+        return abs(drive(s) - x[0]) - level if mode == 0 else -mode * x[1]
 
-    changes.terminal, changes.direction = True, 1
-    phase, x, mode, events = SINCE, np.array([0.1, 0.0]), 0, []
-    end = SINCE + 2 * np.pi * cycles
-    while True:
-        # At zero velocity the guard of the slip is zero, and must first become negative.
-        first = min(phase + (1e-6 if mode else 0.0), end)
-        options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
-        x = solve_ivp(field, (phase, first), x, **options).y[:, -1] if first > phase else x
-        found = solve_ivp(field, (first, end), x, events=changes, max_step=0.3, **options)
-        phase, x = found.t[-1], found.y[:, -1]
-        if not found.t_events[0].size:
-            return [e for e in events if e[0] > end - 2 * np.pi]
-        force, before = drive(phase) - x[0], mode
+    def changed(s, x):
+        nonlocal mode
+        force, before = drive(s) - x[0], mode
         mode = 0 if before and abs(force) <= level else (1 if force > 0 else -1)
-        x = np.array([x[0], 0.0])
-        events.append((phase, x[0], before, mode))
+        events.append((s + SINCE, x[0], before, mode))
+        return x[0], 0.0
+
+    followed(field, (0.1, 0.0), end, [(changes, changed)], rtol=1e-12, atol=1e-13, max_step=0.3)
+    return [e for e in events if e[0] > end + SINCE - 2 * np.pi]

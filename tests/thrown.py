@@ -1,16 +1,10 @@
 """A body thrown against a compliant stop."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import vi_jax as vi
 
 CLOSE = vi.Adaptive(rtol=1e-13, atol=1e-15)
-
-
-class Body(eqx.Module):
-    Y: jax.Array
-    V: jax.Array
 
 
 class Thrown(vi.AbstractMachine):
@@ -28,11 +22,11 @@ class Thrown(vi.AbstractMachine):
         return self.length
 
     def field(self, s, state):
-        return Body(state.V, 0 * state.V)
+        return vi.OscillatorState(state.V, 0 * state.V)
 
 
 def thrown(stop, speed, length, **options):
     """Return the run of a body that starts at zero with this speed."""
     options = {"method": CLOSE, **options}
-    start = Body(jnp.zeros_like(speed), speed)
+    start = vi.OscillatorState(jnp.zeros_like(speed), speed)
     return vi.simulate(Thrown(stop, length), start, 1, **options)

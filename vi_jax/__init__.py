@@ -1,10 +1,11 @@
 """vi_jax: differentiable, vectorised simulation of vibro-impact systems."""
 
 import ast
-import gc
 import importlib
 from pathlib import Path
 from typing import Any
+
+from ._collection import without_collection
 
 # The names of the stub with the packages that they are loaded from on first access, so that
 # `import vi_jax` is quick and a simulation never loads matplotlib.
@@ -18,15 +19,8 @@ __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def _loaded(module: str) -> Any:
-    """Import a module of this package, without the garbage collection that its many objects would
-    cause: a tenth of the time."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
+    with without_collection():
         return importlib.import_module(f".{module}", __name__)
-    finally:
-        if enabled:
-            gc.enable()
 
 
 def __getattr__(name: str) -> Any:

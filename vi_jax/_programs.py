@@ -22,12 +22,12 @@ import numpy as np
 from jax.core import Tracer
 
 from ._checks import unwritable
+from ._collection import without_collection
 from .lanes import (
     Unsupported,
     current_backend,
     raise_interrupts_within,
     vector_only,
-    without_collection,
 )
 
 # With these options XLA compiles two to three times faster. Most of the run time is spent in the

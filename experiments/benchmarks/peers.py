@@ -5,9 +5,10 @@
 # 0.8. The control κ of the motor, or ζ of the ideal drive, is from 0.5 to 1.9. Each code has the
 # best configuration found (see the files in `peer_codes/`). Its processes are pinned to their cores
 # before anything is imported: one process for one core, or one per core. The lanes are distributed
-# in blocks of neighbours. If a code has its own parallel mode, that is measured too. Rounds are
-# interleaved, and compile time is separate. The error is the median error of the final (Y, V),
-# compared with a full-precision run, over the lanes that do not amplify 1e-10 beyond 1e-6.
+# in blocks of neighbours. The codes' own parallel modes were not faster: heyoka's ensembles took
+# twice as long, numba's `prange` as long. Rounds are interleaved, and compile time is separate. The
+# error is the median error of the final (Y, V), compared with a full-precision run, over the lanes
+# that do not amplify 1e-10 beyond 1e-6.
 #
 # Run with `python experiments/benchmarks/peers.py` (extra `bench`; `--quick` for few lanes, writes
 # nothing).
@@ -103,7 +104,7 @@ def report(sections: dict[str, dict]) -> str:
         "those that do not amplify 1e-10 beyond 1e-6; lost is the share of them whose final state "
         "is off by more than 1e-3. The last column is a peer's time over vi_jax's at the same "
         "error, above 1 where vi_jax is faster; < where the peer is more accurate than all "
-        "points of vi_jax. All cores: one process a core, if not said otherwise."
+        "points of vi_jax. All cores: one process a core."
     )
     return "\n\n".join([about, *(section(key, found) for key, found in sections.items())])
 
@@ -114,7 +115,6 @@ LOOKS = {
     f"{OURS} ExactFlight": (BLUE, "*"),
     "heyoka batch": (RED, "s"),
     "heyoka scalar": (RED, "o"),
-    "heyoka ensemble": (RED, "^"),
     "numba": (GREEN, "s"),
     "diffrax Event Tsit5": (PERIODS[2], "s"),
     "diffrax Event Dopri8": (PERIODS[2], "o"),
@@ -131,11 +131,7 @@ def picture(sections: dict[str, dict]) -> Figure:
     ):
         rows = sections[f"states, {drive}, {RESTITUTIONS[0]}, {used}"]["rows"]
         for family, (color, mark) in LOOKS.items():
-            mine = [
-                row
-                for row in rows
-                if row["name"].startswith(family) and "forced" not in row["name"]
-            ]
+            mine = [row for row in rows if row["name"].startswith(family)]
             points = sorted((row["error"], row["seconds"]) for row in mine)
             if points:
                 size = 11 if mark == "*" else 5

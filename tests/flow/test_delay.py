@@ -261,8 +261,7 @@ class Kicked(Linear):
     """A reset whose guard and jump read the past."""
 
     events = vi.Reset(
-        lambda m, t, z, past: past.lag.x - z.x - 0.5,
-        lambda m, t, z, past: dict(y=z.y + past.lag.x),
+        lambda m, t, z, past: past.lag.x - z.x - 0.5, lambda m, t, z, past: dict(y=z.y + past.lag.x)
     )
 
     def field(self, t, z, past):

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,15 +9,6 @@ import pytest
 import vi_jax as vi
 
 CLOSE = vi.Adaptive(rtol=1e-11)
-
-
-class Two(eqx.Module):
-    x: Any
-    n: Any
-
-
-def two(x, n=0.0):
-    return Two(jnp.asarray(float(x)), jnp.asarray(float(n)))
 
 
 def pick(machine, *cases):
@@ -44,7 +34,7 @@ class Cases(vi.AbstractMachine):
 
         def moved(m, s, z):
             x = z.x
-            return Two(pick(m, x + 1, x + 2, 2 * x, 0 * x, x - 1, x, -3 * x), z.n)
+            return dict(x=pick(m, x + 1, x + 2, 2 * x, 0 * x, x - 1, x, -3 * x))
 
         def second(m, s, z):
             x = z.x
@@ -52,16 +42,15 @@ class Cases(vi.AbstractMachine):
 
         def counted(m, s, z):
             x, n = z.x, z.n
-            after = Two(pick(m, x, x, -x, x, x, x, -x), n + pick(m, 1, 1, x, 1, 1, 1, 1))
-            return after
+            return dict(x=pick(m, x, x, -x, x, x, x, -x), n=n + pick(m, 1, 1, x, 1, 1, 1, 1))
 
         return vi.Reset(first, moved), vi.Reset(second, counted)
 
     def field(self, s, z):
         still, p = 0 * z.x, self.p + 0 * z.x
-        return Two(
-            pick(self, -z.x, still, p, p, p, p, p),
-            pick(self, -z.n, still, z.x, still, still, z.x, still),
+        return dict(
+            x=pick(self, -z.x, still, p, p, p, p, p),
+            n=pick(self, -z.n, still, z.x, still, still, z.x, still),
         )
 
 
@@ -71,7 +60,9 @@ def cases():
 
     def run(p):
         return jax.vmap(
-            lambda case: vi.simulate(Cases(case, p), two(0), 3, event_log=4, method=CLOSE)
+            lambda case: vi.simulate(
+                Cases(case, p), vi.State(x=0.0, n=0.0), 3, event_log=4, method=CLOSE
+            )
         )(jnp.arange(len(CASES)))
 
     return jax.jvp(run, (jnp.asarray(P),), (jnp.asarray(1.0),))

@@ -138,27 +138,18 @@ class Lifted(vi.AbstractMachine):
         return (vi.RigidStop(0.0, self.rebound),)
 
     def field(self, s, x):
-        return {"Y": x["V"], "V": x["z"], "z": 0.0 * x["z"]}
-
-    def position(self, x):
-        return x["Y"]
-
-    def velocity(self, x):
-        return x["V"]
-
-    def placed(self, x, Y, V):
-        return {**x, "Y": Y, "V": V}
+        return {"Y": x.V, "V": x.z, "z": 0.0 * x.z}
 
 
 def test_jump_of_a_force_releases_a_resting_body():
-    start = {"Y": jnp.array(0.0), "V": jnp.array(0.0), "z": jnp.array(0.3)}
+    start = vi.State(Y=0.0, V=0.0, z=0.3)
 
     def one(key):
         given = {"noise": vi.WhiteNoise({"z": 1.0}, impulses=1), "key": key}
         return vi.simulate(Lifted(), start, 2, **given).sections
 
     found = jax.vmap(one)(jax.random.split(jax.random.key(0), 64))
-    force, place = np.asarray(found["z"])[:, 1], np.asarray(found["Y"])[:, 2]
+    force, place = np.asarray(found.z)[:, 1], np.asarray(found.Y)[:, 2]
     assert 10 < np.sum(force < 0) < 54
     np.testing.assert_allclose(place, np.minimum(0.5 * force, 0.0), atol=1e-12)
 

@@ -53,10 +53,6 @@ FUNCTIONS = {
     "large unsigned": (
         lambda x, y: (jnp.sign(jnp.where(x > 0, jnp.uint32(3_000_000_000), jnp.uint32(0))),), 0,
     ),
-    "fewer bits": (
-        lambda x, y: tuple(jax.lax.reduce_precision(x, *bits) for bits in
-                           ((8, 7), (5, 10), (8, 23), (11, 20), (11, 52))), 0,
-    ),
     "comparisons": (
         lambda x, y: (x < y, x <= y, x > y, x >= y, x == y, x != y, jnp.isfinite(x)), 0,
     ),

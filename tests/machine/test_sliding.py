@@ -2,17 +2,11 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-
-
-class Pushed(eqx.Module):
-    x: Any
-    y: Any
 
 
 def place(machine, s, z):
@@ -27,11 +21,11 @@ class Relay(vi.AbstractMachine):
     cycle = 2 * jnp.pi
 
     def field(self, s, z, mode):
-        return Pushed(self.amplitude * jnp.sin(s) - mode, mode)
+        return dict(x=self.amplitude * jnp.sin(s) - mode, y=mode)
 
 
 def at(x, y):
-    return Pushed(jnp.asarray(x), jnp.asarray(y))
+    return vi.State(x=x, y=y)
 
 
 @pytest.mark.slow

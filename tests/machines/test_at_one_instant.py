@@ -235,10 +235,7 @@ class PushedOn(vi.Mechanical):
     mass = (1.0, 2.0)
     cycle = 1.0
     growth: float = 0.0
-    contacts = (
-        vi.RigidStop(1.0, 0.5, on="a"),
-        vi.RigidStop(0.0, 0.5, on=lambda q: q.b - q.a),
-    )
+    contacts = (vi.RigidStop(1.0, 0.5, on="a"), vi.RigidStop(0.0, 0.5, on=lambda q: q.b - q.a))
 
     def force(self, t, q, v):
         return dict(a=-self.growth * t, b=1.0 - 3 * jnp.maximum(t - 0.5, 0.0))

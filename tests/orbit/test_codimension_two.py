@@ -178,12 +178,6 @@ class Pitchfork(vi.AbstractMachine):
         grows = self.a - 0.1 * self.b**2 + (self.b - 0.5) * x[0] ** 2 - x[0] ** 4
         return grows * x[0], -x[1]
 
-    def position(self, x):
-        return x[0]
-
-    def velocity(self, x):
-        return x[1]
-
     def mirrored(self, x):
         return tuple(-y for y in x)
 

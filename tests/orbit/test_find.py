@@ -293,15 +293,6 @@ def test_invalid_arguments_raise():
         vi.Newton(tolerance=-1.0)
 
 
-class Sledges(eqx.Module):
-    """Positions and velocities of two bodies."""
-
-    x: jax.Array
-    v: jax.Array
-    y: jax.Array
-    w: jax.Array
-
-
 class Coupled(vi.AbstractMachine):
     """Two bodies joined by a spring: x'' = y - x - c x' + cos s, y'' = x - y - c y' + push. Their
     mean position is arbitrary."""
@@ -313,13 +304,7 @@ class Coupled(vi.AbstractMachine):
     def field(self, s, z):
         pull = z.y - z.x
         force = pull - self.damping * z.v + jnp.cos(s)
-        return Sledges(z.v, force, z.w, self.push - pull - self.damping * z.w)
-
-    def position(self, z):
-        return z.x
-
-    def velocity(self, z):
-        return z.v
+        return dict(x=z.v, v=force, y=z.w, w=self.push - pull - self.damping * z.w)
 
 
 def sledge_speeds(damping):
@@ -331,7 +316,7 @@ def sledge_speeds(damping):
 @pytest.mark.exhaustive
 def test_a_motion_of_arbitrary_position_is_found_near_the_guess():
     """A multiplier is 1 to rounding, so that the equations of the orbit are singular."""
-    guess = Sledges(*map(jnp.asarray, (0.35, 0.1, 0.35, -0.2)))  # equal positions
+    guess = vi.State(x=0.35, v=0.1, y=0.35, w=-0.2)  # equal positions
     orbit = vi.find_orbit(Coupled(), guess)
     assert bool(orbit.successful) and orbit.stability == vi.STABILITY.neutral
     assert not bool(orbit.stable)

@@ -1,6 +1,5 @@
 """The minimal kick, compared with brute force, bisection and SciPy."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -163,12 +162,6 @@ def test_the_minimal_kick_of_steady_sliding():
     assert result.edge.kind == "saddle" and bool(result.settles.stable)
 
 
-class Third(eqx.Module):
-    Y: jax.Array
-    V: jax.Array
-    x: jax.Array
-
-
 class Between(vi.AbstractMachine):
     """x goes to 1 or -1, where an oscillator decays to rest. On the boundary x = 0 it is Ueda's
     driven oscillator."""
@@ -179,18 +172,14 @@ class Between(vi.AbstractMachine):
     def field(self, s, z):
         calm = z.x**2
         pushed = self.push * jnp.cos(s) * (1 - calm) - z.Y**3 - calm * z.Y
-        return Third(z.V, pushed - (0.05 + 0.5 * calm) * z.V, 0.1 * (z.x - z.x**3))
+        return dict(Y=z.V, V=pushed - (0.05 + 0.5 * calm) * z.V, x=0.1 * (z.x - z.x**3))
 
 
-def third(Y, V, x):
-    return Third(jnp.asarray(Y), jnp.asarray(V), jnp.asarray(x))
-
-
-HOME = third(0.0, 0.0, 1.0)
+HOME = vi.State(Y=0.0, V=0.0, x=1.0)
 
 
 def test_a_chaotic_edge_state():
     """Ueda's oscillator with amplitude 7.5 is chaotic."""
-    edge = vi.edge_state(Between(push=7.5), HOME, third(1.0, 0.5, -0.5), rounds=24)
+    edge = vi.edge_state(Between(push=7.5), HOME, vi.State(Y=1.0, V=0.5, x=-0.5), rounds=24)
     assert edge.orbit is None and edge.kind == "chaotic"
     assert np.abs(np.asarray(edge.sections.x)).max() < 2e-5

@@ -94,10 +94,7 @@ MEASURES = {"measure", "compiled", "filtered", "mapped", "partial"}
 )  # fmt: skip
 def test_changes_of_source_change_the_identity(identities, old, new, changed):
     assert old in SOURCE
-    before, after = (
-        identities(SOURCE, "before"),
-        identities(SOURCE.replace(old, new), "after"),
-    )
+    before, after = (identities(SOURCE, "before"), identities(SOURCE.replace(old, new), "after"))
     assert not any(one.startswith(UNVERIFIABLE) for one in before.values()), before
     assert {name for name in before if before[name] != after[name]} == changed
 

@@ -9,10 +9,7 @@ from shaken_oscillator import Shaken
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
 
-AXES = {
-    "drive.frequency_ratio": np.linspace(0.6, 1.4, 7),
-    "start.Y": np.linspace(-1.0, 1.0, 5),
-}
+AXES = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 7), "start.Y": np.linspace(-1.0, 1.0, 5)}
 
 
 @pytest.fixture(scope="module")

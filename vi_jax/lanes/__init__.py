@@ -6,7 +6,6 @@ from ._primitive import vector_only as vector_only
 from ._program import called as called
 from ._program import dependent_results as dependent_results
 from ._program import propagate_marks as propagate_marks
-from ._shared import without_collection as without_collection
 from ._vector import Unsupported as Unsupported
 from .call import interruptible as interruptible
 from .elementary import elementwise_primitive as elementwise_primitive

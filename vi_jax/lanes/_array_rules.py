@@ -643,8 +643,7 @@ def _dot(t: Text, p: dict, avals, a: Array, b: Array, product: Callable) -> Arra
 
 
 def _product(t: Text, left: Array, right: Array, shape, kind: str, product: Callable) -> Array:
-    """Multiply arrays of shapes (batch, n, k) and (batch, m, k), several rows at once. Their sums
-    do not wait for each other, and a number of the other factor is read once for all these rows."""
+    """Multiply arrays of shapes (batch, n, k) and (batch, m, k), several rows at once."""
     batch, rows, columns = shape
     swapped = columns > rows
     if swapped:

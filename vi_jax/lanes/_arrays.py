@@ -75,10 +75,7 @@ def contiguous(shape: Sequence[int]) -> tuple[int, ...]:
 
 
 def write_loop(
-    t: Text,
-    number: int,
-    body: Callable[[Index, list[Value]], list[Value]],
-    first: list[Value],
+    t: Text, number: int, body: Callable[[Index, list[Value]], list[Value]], first: list[Value]
 ) -> list[Value]:
     """Write a loop with a known number of iterations and a scalar counter. Return the final carry.
     `body` maps the iteration's number and the carry to the next carry."""

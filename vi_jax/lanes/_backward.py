@@ -75,8 +75,7 @@ def by_columns(
 
 
 def _weighted(column, weight, kept: int):
-    """Return the weighted sum over all but the first `kept` axes. Values of weight 0 may be NaN, as
-    after a failure."""
+    """Return the weighted sum over all but the first `kept` axes; values of weight 0 may be NaN."""
     product = jnp.where(weight == 0, 0.0, column * weight)
     return jnp.sum(product, axis=tuple(range(kept, product.ndim)))
 

@@ -96,9 +96,8 @@ def object_code(
 
 
 def _run_passes(binding: Any, machine: Any, module: Any, level: int) -> None:
-    """Run LLVM's passes for functions. Those for modules, which run most of them again, took twice
-    as long and made no kernel faster, except that unused arguments of functions cost a block on two
-    corners 3 %."""
+    """Run LLVM's passes for functions. Those for modules took twice as long and made no kernel
+    faster, except that unused arguments of functions cost a block on two corners 3 %."""
     options = binding.create_pipeline_tuning_options(speed_level=level)
     options.loop_vectorization = options.slp_vectorization = False
     options.loop_unrolling = False

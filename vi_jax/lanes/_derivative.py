@@ -101,10 +101,8 @@ def forward(program: LaneProgram, varied: tuple[bool, ...]) -> Derived:
 
 def _widened_forward(program: LaneProgram, widening: Widening, varied: tuple[bool, ...]) -> Derived:
     """Return the same for a widened program, by differentiating its source and widening the result.
-
-    JAX cannot do this in the other order. Under `jax.vmap` within a branch, a result with its own
-    derivative rule gets an axis if its value has one, even if its derivative has one too.
-    """
+    JAX cannot do this in the other order: under `jax.vmap` within a branch, a result with its own
+    derivative rule gets an axis if its value has one, even if its derivative has one too."""
     source, batched, number, wide = widening
     derived, has, *_ = forward(source, varied)
     batched_inputs = (*batched, *(b for b, flag in zip(batched, varied, strict=True) if flag))

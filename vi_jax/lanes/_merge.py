@@ -13,7 +13,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from ._derivative import as_quotient
-from ._program import with_mapped_bodies
+from ._program import needed_equations, with_mapped_bodies
 
 # A call of at most so many equations is written inline, such as those of `jnp.where`: a choice. A
 # step has some hundred of them, whose equations could not be merged.
@@ -50,7 +50,7 @@ class _Merger:
     def _open(self, jaxpr: Jaxpr) -> Jaxpr:
         writer = _Writer(self)
         outs = writer.append(jaxpr.eqns, {}, jaxpr.outvars)
-        return jaxpr.replace(eqns=_needed(writer.eqns, outs), outvars=outs)
+        return jaxpr.replace(eqns=needed_equations(writer.eqns, outs), outvars=outs)
 
 
 class _Writer:
@@ -148,12 +148,3 @@ def _atom_key(atom: Any) -> Any:
         return atom
     aval: Any = atom.aval
     return aval, np.asarray(atom.val, aval.dtype).tobytes()
-
-
-def _needed(eqns: Sequence[Any], outs: Sequence[Any]) -> list[Any]:
-    wanted, kept = {a for a in outs if not isinstance(a, Literal)}, []
-    for eqn in reversed(eqns):
-        if eqn.effects or any(v in wanted for v in eqn.outvars):
-            kept.append(eqn)
-            wanted.update(a for a in eqn.invars if not isinstance(a, Literal))
-    return kept[::-1]

@@ -196,35 +196,6 @@ def _(t, p, d, a):
     return t.select(compare(t, "lt", a, zero, False), t.constant(-1, a.kind), up)
 
 
-@elementwise("reduce_precision")
-def _(t, p, d, a):
-    """Round to fewer bits, ties to even; infinite or zero beyond the smaller range."""
-    digits, most = p["mantissa_bits"], 2 ** (p["exponent_bits"] - 1) - 1
-    limits = np.finfo(d[0])
-    if digits >= limits.nmant and most >= limits.maxexp - 1:
-        return a
-    if a.kind == "float":
-        wide = ELEMENTWISE["reduce_precision"](t, p, [np.float64], t.cast("fpext", a, "double"))
-        return t.cast("fptrunc", wide, "float")
-    shift, one = max(52 - digits, 0), t.constant(1, "i64")
-    bits = t.cast("bitcast", a, "i64")
-    if shift:
-        last = t.binary("and", t.binary("lshr", bits, t.constant(shift, "i64")), one)
-        up = t.binary("add", last, t.constant((1 << (shift - 1)) - 1, "i64"))
-        bits = t.binary("add", bits, up)
-        bits = t.binary("and", bits, t.constant(-(1 << shift), "i64"))
-    rounded = t.cast("bitcast", bits, "double")
-    size, sign = t.intrinsic("fabs", rounded), t.constant(1.0, "double")
-    sign = t.intrinsic("copysign", sign, a)
-    least = t.constant(2.0 ** (1 - most), "double")
-    largest = (2.0 - 2.0**-digits) * 2.0**most if most < 1023 else np.finfo(float).max
-    over = compare(t, "gt", size, t.constant(float(largest), "double"), False)
-    rounded = t.select(over, mul(t, sign, t.constant(float("inf"), "double")), rounded)
-    under = compare(t, "lt", size, least, False)
-    rounded = t.select(under, mul(t, sign, t.zero("double")), rounded)
-    return t.select(compare(t, "ne", a, a, False), a, rounded)
-
-
 for _name, _how in {"max": "gt", "min": "lt"}.items():
     ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_how: extreme(t, how, a, b, is_unsigned(d[0]))
 
@@ -288,12 +259,6 @@ def _(t, p, d, a, b):
         if b.number < 0:
             return div(t, t.constant(1, a.kind), root)
         return root if b.number == 0.5 else mul(t, t.intrinsic("fabs", a), root)
-    if a.kind == "float" and b.number is not None and b.number != round(b.number):
-        # Negative bases have no such power. In double precision its error is far below the
-        # rounding to single precision.
-        wide = t.cast("fpext", a, "double")
-        exponent = mul(t, LIBRARY["log"](t, wide), t.constant(b.number, "double"))
-        return t.cast("fptrunc", LIBRARY["exp"](t, exponent), "float")
     return power(t, a, b)
 
 

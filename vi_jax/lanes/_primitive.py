@@ -17,10 +17,11 @@ from jax.core import ShapedArray
 from jax.extend.core import Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir, partial_eval
 
+from .._collection import without_collection
 from ._arrays import MOST_IN_REGISTERS
 from ._derivative import forward, widened
 from ._program import LaneProgram, batch_of, dependent_parts, shape_of
-from ._shared import set_within, without_collection
+from ._shared import set_within
 from ._vector import Unsupported
 from .call import header, register_handler
 from .runtime import AnyProgram, kernel_of
@@ -133,13 +134,10 @@ def _jvp(primals, tangents, *, program: LaneProgram, backend: str):
 
 
 def _partially_known(trace, *tracers, program: LaneProgram, backend: str):
-    """Evaluate partially for `jax.linearize` and `jax.grad`, where tangents are unknown.
-
-    JAX would postpone the whole program, since some of its inputs are unknown. Here the program of
-    the values runs at once, and that of values and derivatives is postponed. The tracers are those
-    of `JaxprTrace` in JAX's `interpreters/partial_eval.py` (0.10.2). `tests/lanes/test_jax.py`
-    fails if they change.
-    """
+    """Evaluate partially for `jax.linearize` and `jax.grad`, where tangents are unknown: the
+    program of the values runs at once, that of values and derivatives is postponed. The tracers are
+    those of `JaxprTrace` in JAX's `interpreters/partial_eval.py` (0.10.2).
+    `tests/lanes/test_jax.py` fails if they change."""
     unknown = [not t.is_known() for t in tracers]
     of_values = program.values_without(unknown, [t.aval.shape for t in tracers])
     postponed = trace.default_process_primitive(
@@ -221,8 +219,7 @@ def run_on_xla(program: LaneProgram, *args: Any) -> list[Any]:
 def _run_together(
     program: LaneProgram, inputs: list, axes: list[int | None], lanes: int
 ) -> list[Any]:
-    """Return results and rows of lanes with one leading axis; `axes` is 0 for an input with a value
-    for each lane, else `None`."""
+    """Return results and rows of lanes; `axes` is 0 for an input with a leading axis of lanes."""
     n, index = len(program.carry_avals), jnp.arange(lanes)
     carried = [0] * n
     begin = jax.vmap(jaxpr_as_fun(program.begin), in_axes=axes, axis_size=lanes)
@@ -272,8 +269,7 @@ _on_xla = mlir.lower_fun(
 
 
 def _lowered(ctx, *args, program: LaneProgram, backend: str):
-    """Lower to a call of the program's kernel on a CPU. Use XLA's loop if the backend is `"xla"` or
-    if there can be no kernel."""
+    """Lower to a call of the program's kernel on a CPU, else to XLA's loop."""
     otherwise = functools.partial(_on_xla, ctx, *args, program=program, backend=backend)
     if backend == "xla":
         if _vector_only.get():

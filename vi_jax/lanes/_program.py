@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
-from ._shared import without_collection
+from .._collection import without_collection
 from .elementary import horner
 
 
@@ -319,6 +319,22 @@ def bodies(eqn: Any) -> list[Jaxpr]:
 def size_of(jaxpr: Jaxpr) -> int:
     """Return the number of operations; those of an inner jaxpr count once."""
     return sum(1 + sum(map(size_of, bodies(eqn))) for eqn in jaxpr.eqns)
+
+
+def needed_equations(
+    eqns: Sequence[Any],
+    outs: Sequence[Any],
+    reduced: Callable[[Any, tuple[bool, ...]], Any] = lambda eqn, _: eqn,
+) -> list[Any]:
+    """Return the equations that the atoms `outs` need, and those with effects. `reduced` may
+    simplify an equation, given flags of its results that are used."""
+    wanted, kept = {a for a in outs if not isinstance(a, Literal)}, []
+    for eqn in reversed(eqns):
+        used = tuple(v in wanted for v in eqn.outvars)
+        if eqn.effects or any(used):
+            kept.append(reduced(eqn, used))
+            wanted.update(a for a in kept[-1].invars if not isinstance(a, Literal))
+    return kept[::-1]
 
 
 # Primitives with floating-point results whose derivative is zero, or is treated as zero.

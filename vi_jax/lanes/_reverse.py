@@ -214,11 +214,7 @@ def _carried(program: LaneProgram, varied, given) -> tuple[bool, ...]:
 
 
 def _split_passes(
-    program: LaneProgram,
-    name: str,
-    varied: Sequence[bool],
-    weighted: Sequence[bool],
-    kept: int,
+    program: LaneProgram, name: str, varied: Sequence[bool], weighted: Sequence[bool], kept: int
 ) -> ForwardBackward:
     """Return the forward and the backward jaxpr of the function `name`, for flags of its `varied`
     arguments and `weighted` results. The forward pass needs `kept` results. An operation without a

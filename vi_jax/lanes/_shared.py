@@ -1,7 +1,6 @@
-"""Caches that threads share, settings of one thread or task, and a pause of the collector."""
+"""Caches that threads share, and settings of one thread or task."""
 
 import functools
-import gc
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
@@ -67,17 +66,3 @@ def set_within(setting: ContextVar, value: object) -> Iterator[None]:
         yield
     finally:
         setting.reset(token)
-
-
-@contextmanager
-def without_collection() -> Iterator[None]:
-    """Pause the garbage collection within this context. Tracing and compiling leave little garbage
-    but create so many objects that the collector would run again and again, for a tenth of the
-    time."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()

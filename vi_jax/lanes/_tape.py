@@ -277,8 +277,7 @@ class _Writer:
         return arrays
 
     def _row_weights(self, t: Text, lane: Value, place: Value, complete: Value) -> list[Array]:
-        """Return the cotangents of row `place`, for the lanes that have `complete`d it. Small ones
-        are not read if no lane has."""
+        """Return the cotangents of row `place`, for the lanes that have `complete`d it."""
         avals = self.program.weight_avals[self.results :]
         no_weights = zeros(t, avals)
         if not avals:

@@ -42,7 +42,7 @@ from ._arrays import (
     write_loops,
 )
 from ._operations import ELEMENTWISE, IDENTITY_PRIMITIVES, kind_of
-from ._program import CALLS, called, inner, scan_counts, shape_of, size_of
+from ._program import CALLS, called, inner, needed_equations, scan_counts, shape_of, size_of
 from ._text import Text, Value
 
 
@@ -142,7 +142,7 @@ def write(
 def _analysed(jaxpr: Jaxpr) -> tuple[list[Any], dict[Any, int], dict[int, list[Any]]]:
     """Return the needed equations, the number of uses of each variable, and the variables last used
     by each equation."""
-    needed = _needed_equations(jaxpr)
+    needed = needed_equations(jaxpr.eqns, jaxpr.outvars, _without_unused)
     uses, last_use = {}, {}
     for number, atoms in enumerate([*(eqn.invars for eqn in needed), jaxpr.outvars]):
         for atom in atoms:
@@ -155,28 +155,14 @@ def _analysed(jaxpr: Jaxpr) -> tuple[list[Any], dict[Any, int], dict[int, list[A
     return needed, uses, last
 
 
-def _needed_equations(jaxpr: Jaxpr) -> list[Any]:
-    wanted = {a for a in jaxpr.outvars if not isinstance(a, Literal)}
-    kept = []
-    for eqn in reversed(jaxpr.eqns):
-        used = tuple(v in wanted for v in eqn.outvars)
-        if any(used):
-            eqn = eqn if all(used) else _without_unused(eqn, used)
-            kept.append(eqn)
-            wanted.update(a for a in eqn.invars if not isinstance(a, Literal))
-    return kept[::-1]
-
-
 # A call of a large part keeps its unused results if it needs more than this share of the part. A
 # choice: as parts of their own, they made the text of a block on two corners a third longer.
 _LITTLE = 0.25
 
 
 def _without_unused(eqn: Any, used: tuple[bool, ...]) -> Any:
-    """Return a call without the results that are not `used`, and without the arguments that only
-    they need: a derivative of a field is often wanted for one of its numbers. Other equations are
-    returned as they are."""
-    if eqn.primitive.name != "jit":
+    """Return a call without results that are not `used`, and arguments that only they need."""
+    if eqn.primitive.name != "jit" or all(used):
         return eqn
     whole = eqn.params[CALLS["jit"]]
     body, needed = _reduced(whole, used)
@@ -195,7 +181,7 @@ def _reduced(closed: ClosedJaxpr, used: tuple[bool, ...]) -> tuple[ClosedJaxpr, 
     """Return a body with its `used` results, and flags of the arguments that these need."""
     jaxpr = closed.jaxpr
     outs = list(itertools.compress(jaxpr.outvars, used))
-    eqns = _needed_equations(jaxpr.replace(outvars=outs))
+    eqns = needed_equations(jaxpr.eqns, outs, _without_unused)
     atoms = itertools.chain(outs, *(eqn.invars for eqn in eqns))
     read = {a for a in atoms if not isinstance(a, Literal)}
     needed = tuple(v in read for v in jaxpr.invars)
@@ -429,8 +415,7 @@ def _cond(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
 
 
 def _is_cheap(jaxpr: Jaxpr) -> bool:
-    """Return whether skipping a branch does not pay: it has few operations, or only constants, such
-    as zero cotangents of unused arguments."""
+    """Return whether skipping a branch does not pay: few operations, or only constants."""
     constant = (
         eqn.primitive.name == "broadcast_in_dim" and isinstance(eqn.invars[0], Literal)
         for eqn in jaxpr.eqns
@@ -736,11 +721,20 @@ def _tile(x, *, reps):
     return [wide.reshape([r * m for r, m in zip(reps, x.shape, strict=True)])]
 
 
+def _reduce_precision(x, *, exponent_bits, mantissa_bits):
+    """Return the argument, which `jax.checkpoint` marks so."""
+    own = jnp.finfo(x.dtype)
+    if exponent_bits < own.nexp or mantissa_bits < own.nmant:
+        raise Unsupported(f"numbers of {exponent_bits + mantissa_bits + 1} bits")
+    return [x]
+
+
 DERIVED: dict[str, Callable[..., Any]] = {
     "lu": lambda a, **_: _lu(a),
     "triangular_solve": _triangular_solve,
     "cholesky": _cholesky,
     "sort": _sort,
+    "reduce_precision": _reduce_precision,
     "tile": _tile,
     "argmin": functools.partial(_first_extreme, jnp.min),
     "argmax": functools.partial(_first_extreme, jnp.max),

@@ -246,8 +246,7 @@ def _width(program: AnyProgram, lanes: int, bits: int) -> int:
 def _new_kernel(
     program: AnyProgram, cpu: str | None, passes: bool, form: tuple[int, int, tuple[bool, ...]]
 ) -> Kernel:
-    """Return the kernel of a program without a text for these arguments `form` of `kernel_text`. It
-    is compiled only if its text is new."""
+    """Return a new kernel for arguments `form` of `kernel_text`, compiled if its text is new."""
     for jaxpr in program.jaxprs:
         check(jaxpr.jaxpr)
     backward = isinstance(program, ReverseProgram)

@@ -309,11 +309,9 @@ class MotionTable(Table):
         return found
 
     def _bifurcations(self, here: Step, last: Step, halves_left: int) -> Located:
-        """Return the bifurcations between two points, from the tests that change sign.
-
-        The multipliers outside the unit circle are counted. If the bifurcations do not explain the
-        change of their number, the step is halved: two that cross together leave no sign change.
-        """
+        """Return the bifurcations between two points, from the tests that change sign. If they do
+        not explain the change of the number of multipliers outside the unit circle, the step is
+        halved: two that cross together leave no sign change."""
         held = bool(self.problem.conditions)
         kinds, found, explained = _changed_tests(here, last, held=held), [], 0
         sides = self._separate_turn(here, last) if TURNS in kinds and not held else ()
@@ -462,12 +460,10 @@ _CROSSING_MULTIPLIERS = {FOLD: 1, TURNS: 0, DOUBLING: 1, CROSSING: 1, TORUS: 2}
 
 
 def _changed_tests(here: Step, last: Step, *, held: bool) -> list[str]:
-    """Return the tests that change sign from one step to another.
-
-    At a fold the parameter turns back as a multiplier passes 1. If only the parameter turns back,
-    the multiplier touches 1, and the branch leaves another one to both sides. If quantities of the
-    motion are `held`, the two are independent.
-    """
+    """Return the tests that change sign from one step to another. At a fold the parameter turns
+    back as a multiplier passes 1. If only the parameter turns back, the multiplier touches 1, and
+    the branch leaves another one to both sides. If quantities are `held`, the two are
+    independent."""
     before, after = bifurcation_tests(here), bifurcation_tests(last)
     changed = [kind for kind in before if passes_zero(before[kind], after[kind])]
     # Without damping a pair stays on the unit circle, to rounding of either sign.
@@ -491,8 +487,7 @@ def _distances_from_circle(step: Step) -> dict[str, np.ndarray]:
 
 
 def _outside_count(step: Step) -> int | None:
-    """Return the number of multipliers outside the unit circle; `None` if unknown or one is on
-    it."""
+    """Return the number of multipliers outside the unit circle, or `None` if one is on it."""
     sizes = np.abs(step.observed.multipliers)
     if not np.isfinite(sizes).all() or (np.abs(sizes - 1) < ROUNDING).any():
         return None

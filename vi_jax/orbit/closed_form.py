@@ -173,10 +173,8 @@ def _dot(a, b):
 
 
 def _exponential(matrix: Float[Array, "... 4 4"], doublings: int = 0) -> Float[Array, "... 4 4"]:
-    """Return e^(2^doublings matrix), for norms up to 8, by Taylor's series and squaring.
-
-    It uses products only: the library's solver for batches of small systems may lock two threads.
-    """
+    """Return e^(2^doublings matrix), for norms up to 8, by Taylor's series and squaring: by
+    products only, as the library's solver for batches of small systems may lock two threads."""
     identity = jnp.eye(matrix.shape[-1], dtype=matrix.dtype)
     small, first = matrix / 4, jnp.broadcast_to(identity, matrix.shape)
     # A loop compiles faster than the written-out series.
@@ -211,12 +209,9 @@ def _impacts(
     flight: Float[Array, "4 4"], k: Scalar, d: Scalar, period: Scalar
 ) -> tuple[Float[Array, "2"], Float[Array, "2"], Float[Array, "2"], Flag]:
     """Return impact speeds (unit: a ω), impact phases in [0, 2π), the rounding error of these, and
-    whether they are real.
-
-    Let r(v) = f + g v = (d, v) - M (d, -k v) and G⁺ be the adjugate of G. The condition on the
-    phase is then |G⁺ r(v)| = |det G|. Since det G⁺ = det G, the discriminant is det² (|G⁺ g|² - (f
-    × g)²). Neither the speeds nor the test for real ones divide by det.
-    """
+    whether they are real. Let r(v) = f + g v = (d, v) - M (d, -k v) and G⁺ be the adjugate of G.
+    The condition on the phase is then |G⁺ r(v)| = |det G|. Since det G⁺ = det G, the discriminant
+    is det² (|G⁺ g|² - (f × g)²). Neither the speeds nor the test for real ones divide by det."""
     M, G = flight[:2, :2], flight[:2, 2:]
     f = jnp.stack([d - M[0, 0] * d, -M[1, 0] * d])
     g = jnp.stack([k * M[0, 1], 1 + k * M[1, 1]])
@@ -303,11 +298,9 @@ def _turning_point(rates, state, guess, h) -> Scalar:
 
 
 def _multipliers(flight, xi, k, d, v, phase, period) -> Complex[Array, "2 2"]:
-    """Return the eigenvalues of saltation times flight; [motion, multiplier].
-
-    The saltation (δ before to δ after, at fixed time) is [[-k, 0], [(k a⁻ + a⁺)/V⁻, -k]]. Damping
-    cancels in k a⁻ + a⁺ = (1 + k)(cos φ0 - d).
-    """
+    """Return the eigenvalues of saltation times flight; [motion, multiplier]. The saltation (δ
+    before to δ after, at fixed time) is [[-k, 0], [(k a⁻ + a⁺)/V⁻, -k]]. Damping cancels in k a⁻ +
+    a⁺ = (1 + k)(cos φ0 - d)."""
     kick = (1 + k) * (jnp.cos(phase) - d) / v
     half = 0.5 * (kick * flight[0, 1] - k * (flight[0, 0] + flight[1, 1]))
     det = jnp.broadcast_to(k * k * jnp.exp(-2 * xi * period), half.shape)

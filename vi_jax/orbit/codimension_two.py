@@ -185,11 +185,9 @@ def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
 
 
 def _null_vectors(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
-    """Return the null vectors l and r of a square matrix.
-
-    Their signs are coupled: the adjugate is r lᵀ times det U · det V and a positive number, and it
-    is continuous. The vectors `like` of a point close by determine the common sign.
-    """
+    """Return the null vectors l and r of a square matrix. Their signs are coupled: the adjugate is
+    r lᵀ times det U · det V and a positive number, and it is continuous. The vectors `like` of a
+    point close by determine the common sign."""
     left, _, right = np.linalg.svd(matrix)
     found = Vectors(left[:, -1] * np.linalg.det(left) * np.linalg.det(right), right[-1])
     if like is None:
@@ -199,11 +197,9 @@ def _null_vectors(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
 
 
 def _cusp_test(motion: Shooting) -> Test:
-    """Return a test for cusps: the signed rate of the parameters along a curve of folds.
-
-    With the left null vector l of F_x the parameters change so that l·F_p dp = 0, along the line
-    across l·F_p. That line turns slowly, while their direction reverses at a cusp.
-    """
+    """Return a test for cusps: the signed rate of the parameters along a curve of folds. With the
+    left null vector l of F_x they change so that l·F_p dp = 0, along a line that turns slowly,
+    while their direction reverses at a cusp."""
 
     def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
         jacobian = jacobian_at(motion, step.x)
@@ -232,12 +228,10 @@ def _derivatives_along(problem: Shooting, x, right, bend):
 
 def _cubic_test(motion: Shooting, *, twice: bool) -> Test:
     """Return the cubic coefficient of the motions that begin at a doubling or a symmetry breaking.
-
     Let F be the equations of the motion gone through twice, or of the symmetric motion, with null
     vectors l and r, and second and third derivatives B and C. The coefficient is l·(C(r, r, r) + 3
     B(r, w))/6, F_x w = -B(r, r) (Kuznetsov, Elements of Applied Bifurcation Theory, 2004, section
-    5.4). The quadratic coefficient l·B(r, r)/2 is zero by the symmetry of both halves.
-    """
+    5.4). The quadratic coefficient l·B(r, r)/2 is zero by the symmetry of both halves."""
     whole = over_periods(motion, 2) if twice else motion
 
     def test(step: Step, like: Vectors | None) -> tuple[float, None]:

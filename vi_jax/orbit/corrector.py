@@ -86,8 +86,7 @@ def scaled_jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Arra
 @on_host
 def _advance(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, length: Scalar) -> Step:
     """Advance as `advance` does, without observations, by Newton's method on the equations and the
-    plane. The parameter is one of the unknowns, so the Jacobian is not close to singular at a fold.
-    """
+    plane. The parameter is one of the unknowns, so the Jacobian is not near singular at a fold."""
 
     def equations(y):
         return jnp.concatenate([problem.residual(y * scale), jnp.dot(tangent, y - y0)[None]])

@@ -368,8 +368,7 @@ def grazing(
 def _limit_to_checked(
     found: Grazing, graze: LocalGrazing, attractors: Attractors, checked: tuple[float, float]
 ) -> Grazing:
-    """Name the scenario from those values only at which the machine agrees: elsewhere the local map
-    may have other attractors than the machine."""
+    """Name the scenario from those values only at which the machine agrees."""
     size = np.abs(found.forecast.offset)
     is_checked = (size >= checked[0]) & (size <= checked[1])
     subset = jax.tree.map(lambda a: a[is_checked], attractors)

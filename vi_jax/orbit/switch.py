@@ -152,12 +152,10 @@ def _search(
     point: Point, distance: float, what: str, accepts: Callable[[Orbit], bool],
     guesses: Sequence[State] = (),
 ) -> Orbit:  # fmt: skip
-    """Return a motion near a point that does not belong to the branch.
-
-    The section map has no jump there unless an impact falls on the section, so its fixed points are
-    sought. The search begins at the `guesses` on the section, at points close by on the branch, and
-    at a settled simulation. The far side of the point is tried first.
-    """
+    """Return a motion near a point that does not belong to the branch. The section map has no jump
+    there unless an impact falls on the section, so its fixed points are sought: from the `guesses`
+    on the section, from points close by on the branch, and from a settled simulation. The far side
+    of the point is tried first."""
     problem, step, guesses = point.problem, point.step, list(guesses)
     for near_step in (advance(problem, step.x, step.tangent, distance), step):
         if np.all(np.isfinite(near_step.x)):

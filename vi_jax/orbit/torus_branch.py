@@ -17,14 +17,7 @@ from .from_orbit import check_parameter, with_parameters
 from .kinds import GRAZING, TORUS
 from .results import Orbit
 from .tolerances import LOCATED, ROUGHLY, SAME
-from .torus import (
-    MOST,
-    REORDERED,
-    Torus,
-    first_mode,
-    margins_of,
-    torus_of,
-)
+from .torus import MOST, REORDERED, Torus, first_mode, margins_of, torus_of
 from .torus_equations import Curve, Equations, Solved, angles_of, derivative, interpolated
 from .walk import BOUNDS, INTERRUPTED, SAME_CURVE, STALLED, check_walk
 
@@ -229,8 +222,7 @@ class _Walk:
         self.end = end or _End("max_points")
 
     def _advance(self, length: float) -> Solved | str:
-        """Return the next torus, at a distance ahead along the family, or the word for the end of
-        the family if none is found there."""
+        """Return the next torus at a distance ahead, or the word for the end of the family."""
         equations, here, ahead = self.equations, self.points[-1].curve, self.points[-1].tangent
         held = [equations.phase(here), equations.across(here, ahead, length)]
         new = equations.solve(here.plus(length, ahead), held)

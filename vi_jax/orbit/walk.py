@@ -236,11 +236,9 @@ class _Walk:
             self.special.append(dataclasses.replace(point, index=len(self.steps) - 1))
 
     def _first_ending(self, here: Step, new: Step) -> Ending | None:
-        """Return the first event between two points.
-
-        An event is located if its test has changed sign, and then again up to the first event.
-        Beyond it the curve is not one of the machine's: a test may have changed sign twice there.
-        """
+        """Return the first event between two points. An event is located if its test has changed
+        sign, and then again up to the first event. Beyond it the curve is not one of the machine's:
+        a test may have changed sign twice there."""
         rows = [(row, row.test(here)) for row in self.table.event_rows(here, new)]
         for row, begin in rows:
             ending = row.ending(here) if _falls_from_zero(row, begin, new) else None

@@ -194,9 +194,7 @@ def _with_impacts(
     hit = [_place_and_rebound(s, v) for s, v in zip(stops_hit, before, strict=True)]
     places, after = np.reshape(np.array(hit, float), (-1, 2)).T
     added = MotionPath(
-        np.repeat(cycles_at, 2),
-        np.repeat(places, 2),
-        np.stack([before, after], axis=1).ravel(),
+        np.repeat(cycles_at, 2), np.repeat(places, 2), np.stack([before, after], axis=1).ravel()
     )
     index = np.searchsorted(path.cycles, added.cycles)
     return MotionPath(*(np.insert(a, index, b) for a, b in zip(path, added, strict=True)))

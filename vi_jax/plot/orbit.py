@@ -116,8 +116,7 @@ def _is_angle(branch: Branch, name: str) -> bool:
 
 
 def _moving(found: Branch | Sweep) -> str:
-    """Return the name of the extreme that varies: stops may fix it. If none does, return that of
-    the greatest speed of impacts."""
+    """Return the name of the extreme that varies, or if stops fix both, of the fastest impact."""
     extremes = np.stack([found.y_min, found.y_max]).reshape(2, -1)
     extremes = extremes[:, np.isfinite(extremes).all(axis=0)]
     if extremes.shape[1] < 2:

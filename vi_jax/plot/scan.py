@@ -203,8 +203,7 @@ def _two_axes(names: list[str], x: str | None, y: str | None) -> tuple[str, str]
 
 
 def _image(ax: Axes, across: np.ndarray, up: np.ndarray, shades: Any, colors: list[str]) -> None:
-    """Draw cells around points, whose rows may be in any order: `shades` are the indices into
-    `colors` as (up, across)."""
+    """Draw cells around points in any order; `shades` are indices into `colors` as (up, across)."""
     columns, rows = np.argsort(across), np.argsort(up)
     ax.pcolormesh(
         _cell_edges(across[columns]),

@@ -192,8 +192,7 @@ def _described(settling: Settling, section_states: list[Rows], orbit: Orbit | No
 
 
 def _chaotic(rows: Rows) -> bool:
-    """Apply the 0-1 test for chaos (Gottwald and Melbourne 2009) to at least 200 section states: a
-    walk driven by a chaotic signal diffuses like a random one, any other stays bounded."""
+    """Apply the 0-1 test for chaos (Gottwald and Melbourne 2009) to at least 200 section states."""
     count = len(rows)
     if count < _FEWEST:
         return False

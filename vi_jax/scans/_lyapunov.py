@@ -369,8 +369,7 @@ def _observe_windows(the_map: CycleMap, start, carry, windows, window: int) -> A
 
 
 def _observer(the_map: CycleMap, start, window: int, rows: bool = False) -> Any:
-    """Return a function for `jax.lax.scan` that returns rates, durations and integrals; and the
-    states on the section as rows, if asked for."""
+    """Return a `scan` function of rates, durations, integrals and, if asked for, section states."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
     unravel = ravel_pytree(without_modes(start))[1]
     # Directions are relative to the sizes of components. With units of very different sizes,

@@ -5,7 +5,6 @@ import functools
 import itertools
 import json
 import math
-import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from concurrent import futures
@@ -39,12 +38,8 @@ _LEAST = 256
 # Blocks that a cluster has at a time: a choice, more than its cores.
 _ON_CLUSTER = 4096
 
-# Seconds without a new block before a cluster's workers are checked. A choice.
+# Seconds without a new block before a cluster's workers are counted. A choice.
 _PATIENCE = 10.0
-
-# Dask receives its blocks again after this many times the longest wait for a block so far. Before
-# the first block, the longest wait counts as `_LONG` times `_PATIENCE`. A choice.
-_LONG = 6
 
 
 def place_in_words(store: str | Path | None) -> str:
@@ -174,9 +169,8 @@ def run_blocks(
     """Compute the blocks `todo` in an executor, and write each when it is done.
 
     Local threads have one core and one block each; on an accelerator, or over several devices,
-    there is one thread. On Ctrl-C all blocks are written that have ended by then. Blocks that a
-    cluster seems to have lost are submitted again (a killed worker can leave Dask waiting for
-    ever: https://github.com/dask/distributed/issues/3196), after waits that double.
+    there is one thread. On Ctrl-C all blocks are written that have ended by then. Dask itself sends
+    the blocks of a lost worker to another one.
     """
     # As NumPy arrays it is sent with every task: shared data would be lost with their worker.
     packed = jtu.tree_map(lambda x: np.asarray(x) if eqx.is_array(x) else x, program)
@@ -206,37 +200,23 @@ def run_blocks(
                 raise ClusterLost from error
 
         def finish(future: futures.Future) -> None:
-            where = running.get(future)
-            if where is None:  # submitted twice, and done by the other
-                return
             try:
-                write(where, future.result())
+                write(running[future], future.result())
             except (futures.CancelledError, futures.BrokenExecutor) as error:
                 raise ClusterLost from error
             del running[future]
-            for other in [x for x in running if resubmitted and running[x] is where]:
-                other.cancel()
-                del running[other]
 
-        since, longest, resubmitted, patience = time.monotonic(), 0.0, False, _LONG
         try:
             while True:
-                for where in itertools.islice(waiting, max(0, at_once - len(running))):
+                for where in itertools.islice(waiting, at_once - len(running)):
                     begin(where)
                 if not running:
                     return
                 done, _ = futures.wait(
                     running, timeout=_PATIENCE, return_when=futures.FIRST_COMPLETED
                 )
-                waited = time.monotonic() - since
-                if done:
-                    since, longest = time.monotonic(), max(longest, waited, _PATIENCE)
-                    patience = _LONG
-                elif _has_workers(place.cluster) and hasattr(place.cluster, "get_executor"):
-                    if waited > patience * (longest or _LONG * _PATIENCE):
-                        resubmitted, patience = True, 2 * patience
-                        for where in {id(where): where for where in running.values()}.values():
-                            begin(where)
+                if not done:
+                    _warn_without_workers(place.cluster)
                 for future in done:
                     finish(future)
         finally:
@@ -254,11 +234,9 @@ def _executor_of(cluster: Any) -> futures.Executor:
     return cluster.get_executor(pure=False, retries=3)
 
 
-def _has_workers(cluster: Any) -> bool:
+def _warn_without_workers(cluster: Any) -> None:
     if hasattr(cluster, "scheduler_info") and not cluster.scheduler_info()["workers"]:
         warn("The Dask cluster has no workers. The scan waits for new ones, until Ctrl-C.")
-        return False
-    return True
 
 
 def _task(

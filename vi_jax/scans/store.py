@@ -403,8 +403,7 @@ def identity(thing: object) -> str:
 
 
 def _words(thing: Any, visited: dict[int, Any]) -> Iterator[str]:
-    """Yield the words that describe `thing`. Visited objects are in `visited`: references may form
-    cycles."""
+    """Yield the words that describe `thing`; `visited` objects may form cycles."""
     if thing is None or isinstance(thing, int | float | complex | str | bytes | np.dtype):
         yield repr(thing)
     elif isinstance(thing, np.ndarray | np.generic | jax.Array):
@@ -463,8 +462,7 @@ def _is_users(module: str | None) -> bool:
 
 
 def _named(code: types.CodeType) -> set[str]:
-    """Return the names that a function reads, of globals, modules and attributes, also within the
-    functions that it defines."""
+    """Return the names that a function reads, also within the functions that it defines."""
     inner = (x for x in code.co_consts if isinstance(x, types.CodeType))
     return {*code.co_names}.union(*map(_named, inner))
 

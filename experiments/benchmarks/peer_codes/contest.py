@@ -60,21 +60,13 @@ class Bench:
     def __init__(self):
         self.cores = cores()
         self._pinned: list[Worker] = []
-        self._whole: Worker | None = None
 
     @property
     def pinned(self) -> list[Worker]:
         """One worker on each core."""
         if not self._pinned:
-            self._pinned = [Worker([core]) for core in self.cores]
+            self._pinned = [Worker(core) for core in self.cores]
         return self._pinned
-
-    @property
-    def whole(self) -> Worker:
-        """One worker on all cores."""
-        if self._whole is None:
-            self._whole = Worker(self.cores, devices=len(self.cores))
-        return self._whole
 
     def jobs(self, listed: list[Entry], task: Task, *, all_cores: bool) -> list[Job]:
         """Build entries; those for one core are on different cores, to compile in parallel."""
@@ -84,8 +76,6 @@ class Bench:
                 LANES, entry.block, entry.every, len(self.cores) if all_cores else 1
             )
             workers = self.pinned if all_cores else [self.pinned[i % len(self.cores)]]
-            if entry.whole:
-                workers, shares = [self.whole], [np.concatenate(shares)]
             jobs.append(Job(entry, workers, shares))
             jobs[-1].begin_build(task)
         for job in jobs:
@@ -94,7 +84,7 @@ class Bench:
 
     def close(self) -> None:
         """End all workers."""
-        for worker in [*self._pinned, *([self._whole] if self._whole else [])]:
+        for worker in self._pinned:
             worker.close()
 
 

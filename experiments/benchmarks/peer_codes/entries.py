@@ -23,8 +23,6 @@ class Entry:
     options: dict[str, Any] = field(default_factory=dict)
     block: int = 16
     every: int = 1
-    whole: bool = False
-    """True for one process on all cores that uses the code's own parallel mode."""
 
     @property
     def rounds(self) -> int:
@@ -32,15 +30,14 @@ class Entry:
         return ROUNDS if self.every == 1 else SLOW_ROUNDS
 
 
-def ours(name: str, number: float = 0.0, *, whole: bool = False, **options: Any) -> Entry:
+def ours(name: str, number: float = 0.0) -> Entry:
     """Return an entry of vi_jax."""
     inside = "" if not number else f"{number:g}"
     if name == "Taylor" and number > 1:
         inside += ", 8 steps"
     elif name == "FixedStep":
         inside = f"Verner9, {inside}"
-    label = f"{OURS} {name}({inside})" + (", forced devices" if whole else "")
-    return Entry(label, "ours", {"name": name, "number": number, **options}, whole=whole)
+    return Entry(f"{OURS} {name}({inside})", "ours", {"name": name, "number": number})
 
 
 def heyoka(tol: float, **options: Any) -> Entry:
@@ -72,17 +69,10 @@ def entries(drive: str, all_cores: bool) -> list[Entry]:
         )
         for solver, tol in (("Tsit5", 1e-6), ("Dopri8", 1e-9))
     ]
-    listed += [Entry("SciPy DOP853, 1e-09", "scipy_ivp", {"tol": 1e-9}, block=1, every=sparse)]
-    if all_cores:
-        best = ("FixedStep", 10) if drive == "motor" else methods[0]
-        threads = {"tol": 1e-9, "threads": len(cores())}
-        prange = {"tol": 1e-9, "parallel": True}
-        listed += [
-            ours(*best, whole=True),
-            Entry("heyoka ensemble, threads, 1e-09", "heyoka_taylor", threads, whole=True),
-            Entry("numba Dormand–Prince, prange, 1e-09", "numba_rk", prange, whole=True),
-        ]
-    return listed
+    return [
+        *listed,
+        Entry("SciPy DOP853, 1e-09", "scipy_ivp", {"tol": 1e-9}, block=1, every=sparse),
+    ]
 
 
 def derivative_entries() -> list[Entry]:

@@ -38,9 +38,8 @@ def build(
     batch: int = 8,
     wrapped: bool = False,
     jacobian: bool = False,
-    threads: int = 0,
 ) -> tuple[Run, float]:
-    """Build the lanes: `batch=1` selects the scalar integrator, `threads` heyoka's ensemble.
+    """Build the lanes: `batch=1` selects the scalar integrator.
 
     `wrapped` restarts the clock in each cycle: slower, and more accurate over a long run.
     """
@@ -53,7 +52,7 @@ def build(
     views: dict[str, Any] = {}
     event = (hy.t_event if scalar else hy.t_event_batch)(
         variables[0] - task.gap, direction=hy.event_direction.positive,
-        callback=_bounce(task, views, scalar=scalar, jacobian=jacobian, threads=threads),
+        callback=_bounce(task, views, scalar=scalar, jacobian=jacobian),
     )  # fmt: skip
     pars = np.array([1.0, task.xi, task.tau0, task.eps])[: len(parameters)]
     begin = time.perf_counter()
@@ -64,7 +63,7 @@ def build(
     views["time"] = None if scalar else integrator.time
     end = 2 * math.pi * task.cycles
 
-    def launch(integrator: Any, kappa: Any) -> None:
+    def launch(kappa: Any) -> None:
         if scalar:
             integrator.time = 0.0
         else:
@@ -84,7 +83,7 @@ def build(
     def run() -> np.ndarray:
         found = np.zeros((len(parts), rows, batch))
         for i, part in enumerate(parts):
-            launch(integrator, part[0] if scalar else part)
+            launch(part[0] if scalar else part)
             if wrapped:
                 for _ in range(task.cycles):
                     integrator.set_time(0.0)
@@ -97,17 +96,7 @@ def build(
             return lanes[:, :2]
         return lanes[:, size:].reshape(-1, len(PARAMETERS), size)[:, :, :2].transpose(0, 2, 1)
 
-    def ensemble() -> np.ndarray:
-        def generate(copy, i):
-            launch(copy, parts[i])
-            return copy
-
-        found = hy.ensemble_propagate_until_batch(
-            integrator, end, len(parts), generate, algorithm="thread", max_workers=threads
-        )
-        return np.concatenate([entry[0].state[:2].T for entry in found])[: len(kappas)]
-
-    return (ensemble if threads else run), seconds
+    return run, seconds
 
 
 def _integrator(system: list, event: Any, pars: np.ndarray, tol: float, batch: int) -> Any:
@@ -124,16 +113,14 @@ def _integrator(system: list, event: Any, pars: np.ndarray, tol: float, batch: i
 
 
 def _bounce(
-    task: Task, views: dict[str, Any], *, scalar: bool, jacobian: bool, threads: int
+    task: Task, views: dict[str, Any], *, scalar: bool, jacobian: bool
 ) -> Callable[..., bool]:
     """Return the callback of an impact; `views` later receive the integrator's memory."""
     k = task.k
     jump = _saltation(task) if jacobian else None
 
     def bounce(integrator, direction, lane=0):
-        if threads:
-            integrator.state[1, lane] *= -k
-        elif jump is not None:
+        if jump is not None:
             jump(views["state"], views["pars"], lane, views["time"][lane])
         elif scalar:
             views["memory"][1] *= -k

@@ -230,7 +230,7 @@ ideal_lane = stepper(ideal_field, add2, bounce2, norm2)
 
 def _motor(kappas, Y0, xi, tau0, eps, mu, k, gap, cycles, tol):
     final = np.empty((len(kappas), 2))
-    for i in nb.prange(len(kappas)):
+    for i in range(len(kappas)):
         kappa = kappas[i]
         p = (kappa, xi, tau0, eps, mu)
         y = motor_lane((Y0, 0.0, kappa), p, k, gap, cycles, tol)
@@ -240,23 +240,18 @@ def _motor(kappas, Y0, xi, tau0, eps, mu, k, gap, cycles, tol):
 
 def _ideal(kappas, Y0, xi, tau0, eps, mu, k, gap, cycles, tol):
     final = np.empty((len(kappas), 2))
-    for i in nb.prange(len(kappas)):
+    for i in range(len(kappas)):
         y = ideal_lane((Y0, 0.0), (1 / kappas[i], xi), k, gap, cycles, tol)
         final[i, 0], final[i, 1] = y[0], y[1]
     return final
 
 
-_calls: dict[tuple[bool, bool], Any] = {}
+_calls = {True: nb.njit(**OPTIONS)(_motor), False: nb.njit(**OPTIONS)(_ideal)}
 
 
-def build(
-    task: Task, kappas: np.ndarray, *, tol: float, parallel: bool = False
-) -> tuple[Run, float]:
-    """Build the lanes; `parallel` distributes them over all cores (`prange`)."""
-    key = (task.motor, parallel)
-    if key not in _calls:
-        _calls[key] = nb.njit(parallel=parallel, **OPTIONS)(_motor if task.motor else _ideal)
-    call = _calls[key]
+def build(task: Task, kappas: np.ndarray, *, tol: float) -> tuple[Run, float]:
+    """Build the lanes."""
+    call = _calls[task.motor]
 
     def run(cycles: int = task.cycles) -> np.ndarray:
         numbers = (task.Y0, task.xi, task.tau0, task.eps, task.mu, task.k, task.gap)

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from jax.sharding import NamedSharding, PartitionSpec
 
 from .task import Run, Task
 
@@ -41,14 +40,9 @@ def final(task: Task, how: vi.AbstractMethod, theta: jax.Array, Y0: jax.Array) -
 
 
 def build(
-    task: Task,
-    kappas: np.ndarray,
-    *,
-    name: str,
-    number: float = 0.0,
-    jacobian: bool = False,
+    task: Task, kappas: np.ndarray, *, name: str, number: float = 0.0, jacobian: bool = False
 ) -> tuple[Run, float]:
-    """Build the lanes in one process, distributed over its devices.
+    """Build the lanes in one process.
 
     The numbers are arguments of the program: a new restitution needs no compilation.
     """
@@ -56,13 +50,12 @@ def build(
     numbers = jnp.array([task.xi, task.tau0, task.eps, task.gap, task.k, task.Y0])
     if key not in _compiled:
         _compiled[key] = _compile(task, kappas.size, method(name, number), jacobian)
-    compiled, sharding, seconds = _compiled[key]
-    lanes = jax.device_put(jnp.asarray(kappas), sharding[0])
-    numbers = jax.device_put(numbers, sharding[1])
+    compiled, seconds = _compiled[key]
+    lanes = jnp.asarray(kappas)
     return lambda: np.asarray(jax.block_until_ready(compiled(lanes, numbers))), seconds
 
 
-_compiled: dict[tuple, tuple[Any, Any, float]] = {}
+_compiled: dict[tuple, tuple[Any, float]] = {}
 
 
 def _compile(task: Task, size: int, how: vi.AbstractMethod, jacobian: bool):
@@ -85,16 +78,6 @@ def _compile(task: Task, size: int, how: vi.AbstractMethod, jacobian: bool):
             return six(kappas, numbers)
         return jax.vmap(lambda x: lane(x, numbers))(kappas)
 
-    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("lanes",))
-    specs = PartitionSpec("lanes"), PartitionSpec()
-    if jax.device_count() > 1:
-        mapped = jax.shard_map(
-            mapped, mesh=mesh, in_specs=specs, out_specs=specs[0], check_vma=False
-        )
-    sharding = tuple(NamedSharding(mesh, spec) for spec in specs)
-    arguments = [
-        jax.device_put(jnp.zeros(n), where) for n, where in zip((size, 6), sharding, strict=True)
-    ]
     begin = time.perf_counter()
-    compiled = jax.jit(mapped).lower(*arguments).compile()
-    return compiled, sharding, time.perf_counter() - begin
+    compiled = jax.jit(mapped).lower(jnp.zeros(size), jnp.zeros(6)).compile()
+    return compiled, time.perf_counter() - begin

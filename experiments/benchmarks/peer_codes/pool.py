@@ -1,6 +1,6 @@
-"""Workers: processes with cores of their own, in which codes are built and run.
+"""Workers: processes with a core of their own, in which codes are built and run.
 
-A worker begins on its cores, so that each library counts only the cores that it may use.
+A worker begins on its core, so that each library counts only the core that it may use.
 """
 
 import importlib
@@ -24,16 +24,13 @@ def cores() -> list[int]:
 class Worker:
     """A process that builds and runs codes, and answers calls in order."""
 
-    def __init__(self, on: list[int], *, devices: int = 1):
+    def __init__(self, core: int):
         context, before, ours = get_context("spawn"), dict(os.environ), cores()
-        flags = f"{before.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
         # A process begins with the environment and the cores of the one that starts it.
-        os.environ |= {
-            "XLA_FLAGS": flags.strip(), "JAX_PLATFORMS": "cpu", "OMP_NUM_THREADS": str(len(on)),
-        }  # fmt: skip
-        _pin(on)
+        os.environ |= {"JAX_PLATFORMS": "cpu", "OMP_NUM_THREADS": "1"}
+        _pin([core])
         try:
             self._process.start()
         finally:
