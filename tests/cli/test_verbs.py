@@ -8,6 +8,7 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -227,24 +228,58 @@ def test_machines_with_other_arguments(run):
     assert "W = " in run("simulate", si + files)
 
 
-def test_ctrl_c_keeps_the_finished_values_of_a_sweep(run, monkeypatch):
-    """Send Ctrl-C again while results are written."""
-    compute, write = command.sweep, command._write_files
+PARTS = "[simulate]\ncycles = 40\nsettle = 30\nsamples = 4\noutput = 'o.csv'\n"
 
-    def computed(machine, parameter, values, **options):
-        partial = compute(machine, parameter, values[:2], **options)
-        raise vi.Interrupted("sweep", partial)
 
-    def written(*args, **options):
-        os.kill(os.getpid(), signal.SIGINT)
-        return write(*args, **options)
+def split_runs(monkeypatch):
+    """Split runs into parts of ten cycles."""
+    monkeypatch.setattr(command, "_CYCLES", 10)
 
-    monkeypatch.setattr(command, "sweep", computed)
-    monkeypatch.setattr(command, "_write_files", written)
+
+def test_a_run_in_parts_is_the_same_run(monkeypatch):
+    split_runs(monkeypatch)
+    scene = vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.02)
+    options = {"settle": 3, "samples": 4, "impact_log": 2, "method": vi.Adaptive()}
+    whole = vi.simulate(scene, scene.start(Y=0.3), 23, **options)
+    parts, _ = command.run_in_parts(scene, scene.start(Y=0.3), 23, **options)
+    for name in ("sections", "y_min", "impacts", "duration", "samples", "impact_log", "clearance"):
+        each = (jax.tree.leaves(getattr(run, name)) for run in (parts, whole))
+        for x, y in zip(*each, strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
+    assert bool(parts.successful) and int(parts.steps) >= int(whole.steps)
+    assert int(parts.rejected) >= int(whole.rejected) > 0
+
+
+def test_a_run_in_parts_ends_with_the_part_that_fails(monkeypatch):
+    split_runs(monkeypatch)
+    scene = vi.Parameters(control=-1.0).scene()  # its motor stalls
+    found, _ = command.run_in_parts(scene, scene.start(W=0.1), 40)
+    assert not bool(found.successful) and found.impacts.size == 10
+
+
+@pytest.mark.parametrize("pressed, kept", [(1, None), (3, 81)])
+def test_ctrl_c_keeps_the_recorded_cycles_of_a_run(run, monkeypatch, capsys, pressed, kept):
+    """Send Ctrl-C in the first part or a later one, and again while results are written."""
+    split_runs(monkeypatch)
+    compute, calls = command.simulate, []
+
+    def computed(*args, **options):
+        calls.append(1)
+        if len(calls) == pressed:
+            os.kill(os.getpid(), signal.SIGINT)
+        return compute(*args, **options)
+
+    for name in ("_joined", "_write_files"):
+        after = getattr(command, name)
+        press = lambda *args, after=after, **options: (
+            os.kill(os.getpid(), signal.SIGINT), after(*args, **options)
+        )[1]  # fmt: skip
+        monkeypatch.setattr(command, name, press)
+    monkeypatch.setattr(command, "simulate", computed)
     before = signal.getsignal(signal.SIGINT)
-    text = "[sweep]\nparameter = 'damping_ratio'\nvalues = [0.05, 0.06, 0.07]\noutput = 's.csv'"
-    run("sweep", text, 130)
-    assert signal.getsignal(signal.SIGINT) is before and len(rows("s.csv")) == 2
+    run("simulate", PARTS, 130)
+    assert signal.getsignal(signal.SIGINT) is before and len(calls) == pressed
+    assert (len(rows("o.csv")) if kept else os.path.exists("o.csv")) == (kept or False)
 
 
 def test_a_picture_that_cannot_be_drawn_loses_nothing(run):

@@ -4,6 +4,7 @@ Each verb calls the function of its name, prints, writes and draws.
 """
 
 import argparse
+import dataclasses
 import functools
 import inspect
 import os
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 import xarray as xr
@@ -30,7 +32,7 @@ from .._messages import Interrupted, installed_version
 from .._programs import keep_programs
 from ..explore.serve import missing, serve
 from ..explore.subject import Subject, ready
-from ..flow import simulate
+from ..flow import Run, RunOptions, make_plan, simulate
 from ..machine import (
     AbstractMachine,
     State,
@@ -48,6 +50,9 @@ from .named import InputError, check_keys, machine_of, value_of
 _ENDINGS = {"output": (".csv", ".nc"), "picture": (".png", ".pdf", ".svg")}
 _LEFT_OUT = {"machine", "orbit", "options", "progress", "cluster", "throw", "key"}
 _NOT_NEEDED = {*_LEFT_OUT, "start", "guess"}
+
+# Cycles, or samples, of one part of a run: a fraction of a second, or seconds for a slow machine.
+_CYCLES, _SAMPLES = 1024, 16384
 
 _MACHINE = "a class or a function that makes the machine (module:name or path/to/file.py:name)"
 
@@ -162,7 +167,7 @@ def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
     along, start = "sample" if options.get("samples") else "cycle", options.pop("start", None)
     if along == "sample":  # for impacts between samples in the picture
         options.setdefault("impact_log", 8)
-    run = simulate(machine, start, **options)
+    run, interrupted = run_in_parts(machine, machine.start() if start is None else start, **options)
 
     def table() -> Any:
         data = run.to_xarray(along=along)
@@ -184,7 +189,54 @@ def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
         plot.plot_history(sampled, machine=shown, ax=left, unit=unit)
         plot.plot_phase_portrait(sampled, shown, ax=right)
 
-    return Found([str(run)], table, draw, not bool(run.failed))
+    return Found([str(run)], table, draw, not bool(run.failed), interrupted)
+
+
+def run_in_parts(
+    machine: AbstractMachine, start: Any, cycles: int, *, samples: int = 0, **options: Any
+) -> tuple[Run, bool]:
+    """Return a run of one motion, as `simulate`, and whether Ctrl-C ended it. The run then has the
+    cycles recorded so far."""
+    length, runs = max(1, min(_CYCLES, _SAMPLES // max(1, samples))), []
+    settled = options.get("settle", 0)
+    make_plan(machine, start, cycles, RunOptions(samples=samples, **options))  # checks them all
+    if cycles <= length or options.keys() & {"estimate", "max_steps", "noise"}:
+        return simulate(machine, start, cycles, samples=samples, **options), False
+    try:
+        for done in range(0, cycles, length):
+            count = min(length, cycles - done)
+            run = simulate(machine, start, count, samples=samples, **options)
+            if done and run.outcome_cycle is not None and run.outcome_cycle >= 0:
+                run = dataclasses.replace(run, outcome_cycle=run.outcome_cycle + settled + done)
+            runs.append(run)
+            start, options["settle"] = run.last, 0
+            if not bool(run.successful):
+                break
+    except KeyboardInterrupt:
+        if not runs:
+            raise
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # also while parts are joined
+        return _joined(runs), True
+    return _joined(runs), False
+
+
+def _joined(runs: list[Run]) -> Run:
+    """Return parts of one run as one; a part begins with the last state of that before it."""
+    time, length = 0.0, runs[0].impacts.size
+    for i, run in enumerate(runs):
+        if run.samples is not None:
+            later = {"cycles": run.samples.cycles + i * length, "time": run.samples.time + time}
+            runs[i] = dataclasses.replace(run, samples=dataclasses.replace(run.samples, **later))
+            time = later["time"][-1]
+
+    def row(*parts: Any) -> Any:
+        if not jnp.ndim(parts[0]):
+            return parts[-1]
+        begin = int(len(parts[0]) != length)
+        return jnp.asarray(np.concatenate([parts[0], *(x[begin:] for x in parts[1:])]))
+
+    tried, rejected = (sum(getattr(run, name) for run in runs) for name in ("steps", "rejected"))
+    return dataclasses.replace(jtu.tree_map(row, *runs), steps=tried, rejected=rejected)
 
 
 def _sweep(machine: AbstractMachine, options: dict[str, Any], *, y: str | None = None) -> Found:
