@@ -292,6 +292,13 @@ ASIN = (
     0.01032281435018578, 0.005457506718640358, 0.01740087944269402, -0.014851887071247204,
     0.028757851367421566,
 )  # fmt: skip
+# tan on |z| <= π/4, error 7.5e-18.
+TAN = (
+    0.3333333333333333, 0.1333333333333336, 0.05396825396821662, 0.021869488538180618,
+    0.008863235472360148, 0.003592129022471812, 0.0014558233340176158, 0.0005901127322555614,
+    0.00023866159900899438, 9.876874636871174e-05, 3.392890384212224e-05, 2.7108596383546008e-05,
+    -1.0197280163552528e-05, 1.953688210814275e-05, -9.74523086709087e-06, 3.949593305285971e-06,
+)  # fmt: skip
 # sinh on |z| <= 1, error 9.2e-18.
 SINH = (
     0.16666666666666666, 0.008333333333333299, 0.00019841269841324198, 2.7557319191381816e-06,
@@ -302,6 +309,10 @@ SINH = (
 _EXP_REST = tuple(1 / factorial(n) for n in range(2, 14))
 # ln((1 + s) / (1 - s)) / s - 2 over s², the same; s² <= 0.0295.
 _LOG = tuple(2 / (2 * n + 3) for n in range(10))
+
+_HALF_PI = [part / 2 for part in _parts_of(pi, 4)]
+# For |x| up to this bound the products of n and the first three parts are exact.
+_TURNED = 2.0**20
 
 
 def _odd(x: Real, value: Real) -> Real:
@@ -433,6 +444,27 @@ def acos(x: Real) -> Real:
     return high + (off + (base * (_PI_LOW / 2) + factor * rest))
 
 
+def tan(x: Real) -> Real:
+    n = (x * (2 / pi)).call("roundeven")
+    first = x - n * _HALF_PI[0]  # exact up to 2^20 quarter turns, like the next two products
+    second, off = two_sum(first, -(n * _HALF_PI[1]))
+    third, more = two_sum(second, -(n * _HALF_PI[2]))
+    r, low = fast_sum(third, (off + more) - n * _HALF_PI[3])
+    square = r * r
+    rest = r * square * square.polynomial(TAN)
+    rest = rest + low * (1.0 + (r + rest) * (r + rest))
+    value, off = fast_sum(r, rest)
+    inverse = -1.0 / value
+    inverse = inverse + inverse * (inverse.call("fma", value, 1.0) + inverse * off)
+    even = (2.0 * (0.5 * n).call("roundeven")).equals(n)
+    a = x.size()
+    near, far = value.choose(even, inverse).value, a > _TURNED
+    with x.t.skipped_unless(far, rare=True) as fork:  # by the C library
+        chosen = x.t.select(far, x.t.per_lane("tan", x.value), near)
+    value = Real(x.t, fork.joined(chosen, near))
+    return x.choose(a < 2.0**-30, value)
+
+
 def rule(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of `Real`s, with one or several results, as a rule for either precision."""
 
@@ -448,12 +480,12 @@ def rule(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 # Rarely used functions, called lane by lane in the C library, two to four times slower.
-_BY_LANE = ("tan", "asinh", "acosh", "atanh", "exp2", "cbrt", "erf", "erfc")
+_BY_LANE = ("asinh", "acosh", "atanh", "exp2", "cbrt", "erf", "erfc")
 
 LIBRARY = {
     function.__name__: rule(function)
     for function in (
-        sin, cos, sincos, exp, log, tanh, sinh, cosh, asin, acos, atan, atan2, expm1, log1p,
+        sin, cos, sincos, exp, log, tanh, tan, sinh, cosh, asin, acos, atan, atan2, expm1, log1p,
     )
 } | {name: lambda t, x, name=name: t.per_lane(name, x) for name in _BY_LANE}  # fmt: skip
 

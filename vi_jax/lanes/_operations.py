@@ -259,6 +259,12 @@ def _(t, p, d, a, b):
         if b.number < 0:
             return div(t, t.constant(1, a.kind), root)
         return root if b.number == 0.5 else mul(t, t.intrinsic("fabs", a), root)
+    if a.kind == "float" and b.number is not None and b.number != round(b.number):
+        # Negative bases have no such power. In double precision its error is far below the
+        # rounding to single precision.
+        wide = t.cast("fpext", a, "double")
+        exponent = mul(t, LIBRARY["log"](t, wide), t.constant(b.number, "double"))
+        return t.cast("fptrunc", LIBRARY["exp"](t, exponent), "float")
     return power(t, a, b)
 
 
