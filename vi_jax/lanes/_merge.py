@@ -106,10 +106,11 @@ class _Writer:
 def _without_arithmetic(eqn: Any, given: Sequence[Any]) -> Any:
     """Return the result of an equation with known numbers, or of one that returns its argument (a
     number times 1, for example); `None` for other equations."""
-    name, numbers = eqn.primitive.name, [x for x in given if isinstance(x, Literal)]
+    name = eqn.primitive.name
+    numbers: list[Any] = [x for x in given if isinstance(x, Literal)]
     if name not in _KNOWN or not numbers or eqn.outvars[0].aval.shape:
         return None
-    aval = eqn.outvars[0].aval
+    aval: Any = eqn.outvars[0].aval
     if len(numbers) == len(given):
         with np.errstate(all="ignore"):
             known = _KNOWN[name](*(np.asarray(x.val, x.aval.dtype) for x in numbers))
