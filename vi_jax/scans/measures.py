@@ -415,10 +415,10 @@ class Regime(AbstractMeasure):
     Otherwise it is transiently chaotic: it has settled meanwhile, or is about to. `REGIMES` has the
     numbers for these kinds in `period`.
 
-    The others are observed for another `averaged` cycles. They are quasi-periodic if averages over
+    The others and these are observed for another `averaged` cycles. They are quasi-periodic if averages over
     both halves agree to many digits (see `Rotation`), the exponent is zero to the accuracy of that
     time, and no section is the first one again; chaotic with few digits and a positive exponent;
-    else unsettled, such as a motion with a period above `longest`. Quasi-periodic motions close to
+    else as before or unsettled, such as a motion with a period above `longest`. Quasi-periodic motions close to
     a resonance, or with more than two frequencies, and those of machines without losses are mostly
     called unsettled.
 
@@ -497,8 +497,11 @@ class Regime(AbstractMeasure):
 
     def needs_refinement(self, found, pass_number=0):
         """Return whether it does not repeat; at the second pass, whether it is chaotic."""
-        is_outer = (jnp.asarray(pass_number) == 0) | self._is_last(pass_number)
-        return found["period"] == jnp.where(is_outer, REGIMES.unsettled, REGIMES.chaotic)
+        is_last, period = self._is_last(pass_number), found["period"]
+        is_outer = (jnp.asarray(pass_number) == 0) | is_last
+        wanted = period == jnp.where(is_outer, REGIMES.unsettled, REGIMES.chaotic)
+        # On a torus that attracts slowly the exponent is positive for a while.
+        return wanted | is_last & (period == REGIMES.transient)
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
         """Return whether it is chaotic, at the second pass still chaotic; at the last one whether
@@ -515,7 +518,7 @@ class Regime(AbstractMeasure):
         chaos = jnp.where(seen.exponent > self.threshold, REGIMES.chaotic, otherwise)
         growth = seen.per_cycle * observed
         # Over few cycles the exponent of a torus may be as large: the last pass decides.
-        is_weak = again & bool(self.averaged) & (chaos == REGIMES.chaotic) & (growth < _GROWS)
+        is_weak = bool(self.averaged) & (chaos == REGIMES.chaotic) & (growth < _GROWS)
         chaos = jnp.where(is_weak, REGIMES.unsettled, chaos)
         # A motion without losses that repeats after many cycles has digits and no growth, too.
         noise = _noise(self.wander, seen.nearest.dtype)
@@ -524,6 +527,7 @@ class Regime(AbstractMeasure):
         is_torus = seen.successful & is_neutral & moves_on
         torus = jnp.where(is_torus, REGIMES.quasiperiodic, before)
         is_chaos = seen.successful & (seen.digits < _FEW) & (growth > _GROWS)
+        is_chaos = is_chaos & (before != REGIMES.transient)
         torus = jnp.where(is_chaos, REGIMES.chaotic, torus)
         return {"period": jnp.where(is_last, torus, chaos).astype(before.dtype)}
 
