@@ -50,7 +50,7 @@ def with_delay_error(orbit: Orbit) -> Orbit:
     """Return a single orbit of a chain with its difference from a run with the whole history."""
     chain: Any = orbit.machine
     machine = machine_of_chain(chain)
-    if machine is None or isinstance(orbit.residual, Tracer):
+    if machine is None or any(isinstance(x, Tracer) for x in jax.tree.leaves(orbit)):
         return orbit
     if orbit.residual.ndim or not bool(orbit.successful):
         return orbit
