@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from scipy.special import lambertw
 
 from delayed import Fed, Struck, by_steps
-from scipy.special import lambertw
 
 
 @pytest.mark.slow

@@ -193,7 +193,8 @@ def _reading_kind(kind: type, past: type[Past]) -> type:
         return reading(without_past(self).observed_every(interval), self._past)
 
     def observed_machine(self: Any) -> Any:
-        return reading(without_past(self).observed_machine, self._past)
+        machine: Any = without_past(self)
+        return reading(machine.observed_machine, self._past)
 
     def parts(name: str) -> property:
         return property(lambda self: tuple(map(_given_past, getattr(without_past(self), name))))
