@@ -7,7 +7,7 @@ import pytest
 import vi_jax as vi
 from scipy.special import lambertw
 
-from delayed import Fed, Struck, by_steps
+from delayed import Fed, Masses, Struck, by_steps
 
 
 @pytest.mark.slow
@@ -28,7 +28,7 @@ def test_boundary_of_stability_is_that_of_the_closed_form():
 
 @pytest.mark.slow
 def test_orbit_with_an_impact_is_checked_by_the_whole_history():
-    orbit = vi.find_orbit(Struck(), vi.simulate(Struck(), settle=30).last)
+    orbit = vi.find_orbit(Masses(), vi.simulate(Masses(), settle=30).last)
     assert orbit.successful
     np.testing.assert_allclose(orbit.state.x, -0.3631911886, rtol=0, atol=2e-5)
     np.testing.assert_allclose(orbit.impact_phase, [7.0342180392], rtol=0, atol=1e-4)
@@ -145,6 +145,25 @@ def test_self_excited_motion():
     length = lambda pump: vi.find_orbit(SelfExcited(pump=pump)).duration
     slope = (length(0.501) - length(0.499)) / 0.002
     np.testing.assert_allclose(jax.grad(length)(0.5), slope, rtol=1e-4)
+
+
+class Wright(vi.AbstractMachine):
+    """Wright's equation T' = -1.8 T(t - 1) (1 + T), whose cycles end where T rises through zero."""
+
+    cycle = vi.rising("T", usual=4.0)
+    delays = property(lambda self: dict(late=1.0))
+
+    def field(self, t, z, past):
+        return dict(T=-1.8 * past.late.T * (1 + z.T))
+
+
+@pytest.mark.slow
+def test_delay_error_of_one_number_is_that_of_the_duration():
+    run = vi.simulate(Wright(), vi.State(T=0.5), cycles=1, settle=40)
+    orbit = vi.find_orbit(vi.delay_chain(Wright(), 6, start=run.last.state), run.last)
+    error = abs(float(orbit.duration / run.duration[0]) - 1)
+    assert 1e-8 < error < 1e-2
+    np.testing.assert_allclose(orbit.delay_error, error, rtol=1e-3)
 
 
 @pytest.mark.slow

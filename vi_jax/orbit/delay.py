@@ -68,4 +68,7 @@ def with_delay_error(orbit: Orbit) -> Orbit:
     run = simulate(machine, start, periods * cycles, method=orbit.method, record="sections")
     last, row = in_rows(run.sections)[-1], in_rows(own, 0)
     error = distance(last, row, row_sizes(chain, state)[: row.size])
+    if run.duration is not None:  # on a section one number of the state is always the same
+        duration = jnp.sum(run.duration[-cycles:])
+        error = jnp.maximum(error, jnp.abs(duration / orbit.duration - 1))
     return dataclasses.replace(orbit, delay_error=error)
