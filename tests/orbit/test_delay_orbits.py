@@ -160,7 +160,8 @@ class Wright(vi.AbstractMachine):
 @pytest.mark.slow
 def test_delay_error_of_one_number_is_that_of_the_duration():
     run = vi.simulate(Wright(), vi.State(T=0.5), cycles=1, settle=40)
-    orbit = vi.find_orbit(vi.delay_chain(Wright(), 6, start=run.last.state), run.last)
+    chain = vi.delay_chain(Wright(), 6, start=run.last.state)
+    orbit = vi.find_orbit(chain, chain.chained(run.last))
     error = abs(float(orbit.duration / run.duration[0]) - 1)
     assert 1e-8 < error < 1e-2
     np.testing.assert_allclose(orbit.delay_error, error, rtol=1e-3)

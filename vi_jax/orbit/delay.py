@@ -16,6 +16,7 @@ from ..machine import (
     has_delays,
     history_in,
     in_rows,
+    is_autonomous,
     longest_delay,
     machine_of_chain,
     modes_of,
@@ -65,7 +66,8 @@ def with_delay_error(orbit: Orbit) -> Orbit:
         periods += int(min(np.log(SAME) / np.log(max(largest, 1e-3)), _MOST_PERIODS))
     own = chain._past.own(state)
     start = HybridState(own, modes_of(orbit.state) or (), history)
-    run = simulate(machine, start, periods * cycles, method=orbit.method, record="sections")
+    record = "motion" if is_autonomous(chain, state) else "sections"
+    run = simulate(machine, start, periods * cycles, method=orbit.method, record=record)
     last, row = in_rows(run.sections)[-1], in_rows(own, 0)
     error = distance(last, row, row_sizes(chain, state)[: row.size])
     if run.duration is not None:  # on a section one number of the state is always the same
