@@ -45,6 +45,20 @@ class Struck(Fed):
         return vi.RigidStop(self.gap, self.restitution, on=("x", "u"))
 
 
+class Masses(vi.Mechanical):
+    """`Struck` as a machine of masses."""
+
+    q = ("x",)
+    mass = (1.0,)
+    cycle = 2 * np.pi / 0.8
+    delays = property(lambda self: dict(sensor=4.0))
+    contacts = vi.RigidStop(0.6, 0.7, on="x")
+
+    def force(self, t, q, v, past):
+        pull = 0.3 * (past.sensor.x - q.x)
+        return dict(x=jnp.cos(0.8 * t) - q.x - 0.1 * v.x + pull)
+
+
 def by_steps(
     rate: Callable[..., Any], start: Sequence[float], before: Callable[[float], Any],
     delays: Sequence[float], end: float, *, guard: Callable[..., float] | None = None,

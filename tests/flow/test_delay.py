@@ -10,7 +10,7 @@ import pytest
 import vi_jax as vi
 from vi_jax import lanes
 
-from delayed import Struck, by_steps, struck_by_steps
+from delayed import Masses, Struck, by_steps, struck_by_steps
 
 
 class Linear(vi.AbstractMachine):
@@ -188,20 +188,6 @@ def test_run_continues_with_its_history():
     np.testing.assert_allclose(second.last.x, -0.3721662410390, rtol=0, atol=1e-9)
     again = vi.simulate(Struck(), first.last.state, cycles=1, settle=1)  # without its history
     assert abs(float(again.last.x - second.last.x)) > 1e-3
-
-
-class Masses(vi.Mechanical):
-    """`Struck` as a machine of masses."""
-
-    q = ("x",)
-    mass = (1.0,)
-    cycle = 2 * np.pi / 0.8
-    delays = property(lambda self: dict(sensor=4.0))
-    contacts = vi.RigidStop(0.6, 0.7, on="x")
-
-    def force(self, t, q, v, past):
-        pull = 0.3 * (past.sensor.x - q.x)
-        return dict(x=jnp.cos(0.8 * t) - q.x - 0.1 * v.x + pull)
 
 
 def test_machine_of_masses():

@@ -56,6 +56,22 @@ def test_a_constant_that_is_not_a_number_gives_not_finite():
         assert run.result == vi.RESULTS.not_finite
 
 
+class Arrayed(vi.AbstractMachine):
+    """x'' = -x with the velocity in an array, in which another number decays."""
+
+    cycle = vi.rising("x", usual=6.0)
+
+    def field(self, t, z):
+        return dict(x=z.w[0], w=jnp.stack([-z.x, -z.w[1]]))
+
+
+def test_an_array_may_follow_a_number_in_a_state_with_a_section():
+    run = vi.simulate(Arrayed(), vi.State(x=0.0, w=jnp.ones(2)), 3)
+    np.testing.assert_allclose(run.duration, 2 * np.pi, rtol=1e-8)
+    np.testing.assert_allclose(run.last.w, [1.0, np.exp(-6 * np.pi)], rtol=1e-7)
+    assert run.labels == ("x", "x")
+
+
 class Ending(vi.AbstractMachine):
     """x' = 1, with an outcome at each of many places; the start lies before the given one."""
 

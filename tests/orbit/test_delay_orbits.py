@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from scipy.special import lambertw
 
-from delayed import Fed, Struck
+from delayed import Fed, Masses, Struck, by_steps
 
 
 @pytest.mark.slow
@@ -27,7 +28,7 @@ def test_boundary_of_stability_is_that_of_the_closed_form():
 
 @pytest.mark.slow
 def test_orbit_with_an_impact_is_checked_by_the_whole_history():
-    orbit = vi.find_orbit(Struck(), vi.simulate(Struck(), settle=30).last)
+    orbit = vi.find_orbit(Masses(), vi.simulate(Masses(), settle=30).last)
     assert orbit.successful
     np.testing.assert_allclose(orbit.state.x, -0.3631911886, rtol=0, atol=2e-5)
     np.testing.assert_allclose(orbit.impact_phase, [7.0342180392], rtol=0, atol=1e-4)
@@ -70,6 +71,100 @@ def test_boundary_in_two_parameters():
     omega = np.sqrt(1 + a)
     exact = (np.arctan2(-2 * 0.05 * omega, 1 + gain - omega**2) + 2 * np.pi) / omega
     np.testing.assert_allclose(delay, exact, rtol=0, atol=1e-6)
+
+
+class Relaxing(vi.AbstractMachine):
+    """T' = -T(t - 1) - 0.2 T + cos(2πt/6), a state with one component."""
+
+    cycle = 6.0
+    delays = property(lambda self: dict(valve=1.0))
+
+    def field(self, t, z, past):
+        return dict(T=-past.valve.T - 0.2 * z.T + jnp.cos(2 * jnp.pi * t / 6))
+
+    def start(self):
+        return vi.State(T=0.0)
+
+
+@pytest.mark.slow
+def test_orbit_of_one_component_is_that_of_the_closed_form():
+    """T = Re A exp(iωt) with A (iω + exp(-iω) + 0.2) = 1, and λ + 0.2 + exp(-λ) = 0."""
+    orbit = vi.find_orbit(Relaxing())
+    omega = 2 * np.pi / 6
+    amplitude = 1 / (1j * omega + np.exp(-1j * omega) + 0.2)
+    np.testing.assert_allclose(orbit.state.T, amplitude.real, rtol=0, atol=1e-9)
+    np.testing.assert_allclose([orbit.y_max, -orbit.y_min], abs(amplitude), rtol=0, atol=1e-9)
+    found = np.sort_complex(orbit.multipliers[:4])
+    exact = np.exp(6 * (lambertw(-np.exp(0.2), k=[0, -1, 1, -2]) - 0.2))
+    np.testing.assert_allclose(found, np.sort_complex(exact), rtol=0, atol=1e-9)
+
+
+class SelfExcited(vi.AbstractMachine):
+    """x'' = (0.5 - x²) x' - x(t - 1), whose cycles end where x rises through zero."""
+
+    pump: float = 0.5
+
+    cycle = vi.rising("x", usual=6.3)
+    delays = property(lambda self: dict(spring=1.0))
+
+    def field(self, t, z, past):
+        return dict(x=z.u, u=(self.pump - z.x**2) * z.u - past.spring.x)
+
+    def start(self):
+        return vi.State(x=0.0, u=1.0)
+
+
+class EndedByReset(SelfExcited):
+    cycle = 6.3
+    events = vi.Reset(lambda m, t, z, past: z.x, ends_cycle=True)
+
+
+@pytest.mark.slow
+def test_self_excited_motion():
+    """By the method of steps: instants, and the multiplier by which durations approach the last."""
+    end, instants = by_steps(
+        lambda t, y, past: [y[1], (0.5 - y[0] ** 2) * y[1] - past[0][0]], [0.0, 1.0],
+        lambda t: [0.0, 1.0], [1.0], 48.0, guard=lambda t, y, past: y[0], jump=lambda y, past: y,
+    )  # fmt: skip
+    durations = np.diff(instants, prepend=0.0)
+    chain = vi.delay_chain(SelfExcited())
+    for machine in (SelfExcited(), chain):
+        run = vi.simulate(machine, cycles=5)
+        np.testing.assert_allclose(run.duration, durations[:5], rtol=0, atol=1e-8)
+    for machine in (EndedByReset(), vi.delay_chain(EndedByReset())):
+        last = vi.simulate(machine.observed_every(8.0), cycles=6).last
+        np.testing.assert_allclose([last.x, last.u], end, rtol=0, atol=1e-7)
+    orbit = vi.find_orbit(SelfExcited())
+    np.testing.assert_allclose(orbit.duration, durations[-1], rtol=0, atol=1e-8)
+    assert float(orbit.delay_error) < 1e-9
+    shrinks = (durations[4] - durations[3]) / (durations[3] - durations[2])
+    np.testing.assert_allclose(orbit.multipliers[0], shrinks, rtol=5e-3)
+    found = vi.lyapunov(SelfExcited(), cycles=64, settle=8).exponents
+    exact = [0.0, np.log(orbit.multipliers[0].real) / durations[-1]]
+    np.testing.assert_allclose(found[:2], exact, rtol=0, atol=2e-3)
+    length = lambda pump: vi.find_orbit(SelfExcited(pump=pump)).duration
+    slope = (length(0.501) - length(0.499)) / 0.002
+    np.testing.assert_allclose(jax.grad(length)(0.5), slope, rtol=1e-4)
+
+
+class Wright(vi.AbstractMachine):
+    """Wright's equation T' = -1.8 T(t - 1) (1 + T), whose cycles end where T rises through zero."""
+
+    cycle = vi.rising("T", usual=4.0)
+    delays = property(lambda self: dict(late=1.0))
+
+    def field(self, t, z, past):
+        return dict(T=-1.8 * past.late.T * (1 + z.T))
+
+
+@pytest.mark.slow
+def test_delay_error_of_one_number_is_that_of_the_duration():
+    run = vi.simulate(Wright(), vi.State(T=0.5), cycles=1, settle=40)
+    chain = vi.delay_chain(Wright(), 6, start=run.last.state)
+    orbit = vi.find_orbit(chain, chain.chained(run.last))
+    error = abs(float(orbit.duration / run.duration[0]) - 1)
+    assert 1e-8 < error < 1e-2
+    np.testing.assert_allclose(orbit.delay_error, error, rtol=1e-3)
 
 
 @pytest.mark.slow

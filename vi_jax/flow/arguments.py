@@ -56,6 +56,7 @@ from ..machine import (
     shown_modes,
     stops_of,
     with_some_past,
+    without_history,
     without_modes,
 )
 from ..machine import State as NamedState
@@ -357,7 +358,8 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
     if isinstance(machine, Mechanical):
         q = machine._q_shapes
         wanted = q | {f"v.{name}": shape for name, shape in q.items()}
-        given = {part: jnp.shape(x) for part, x in named_leaves(state)}
+        own = without_history(machine, state) if isinstance(state, NamedState) else state
+        given = {part: jnp.shape(x) for part, x in named_leaves(own)}
         if not isinstance(state, NamedState) or given != wanted:
             words = (
                 f"{name} of shape {shape}" if shape else name for name, shape in wanted.items()

@@ -238,7 +238,10 @@ def _position(machine: "AbstractMachine", state: State) -> Scalar:
 
 
 def _velocity(machine: "AbstractMachine", state: State) -> Scalar:
-    return state.V if has_velocity(machine, state) else jtu.tree_leaves(state)[:2][-1]
+    if has_velocity(machine, state):
+        return state.V
+    leaves = jtu.tree_leaves(state)
+    return [x for x in leaves[:2] if jnp.shape(x) == jnp.shape(leaves[0])][-1]
 
 
 def _placed(machine: "AbstractMachine", state: State, Y: Scalar, V: Scalar) -> State:
@@ -397,7 +400,8 @@ class AbstractMachine(Shown):
 
     def velocity(self, state: State) -> Scalar:
         """Return the velocity that an impact reverses; it has the sign of d(position)/ds. Without
-        stops and `V` it is the second component, which pictures draw over the position."""
+        stops and `V` it is the second component, which pictures draw over the position; the first
+        if the second is an array."""
         return self._first_coordinate.velocity(state)
 
     def placed(self, state: State, Y: Scalar, V: Scalar) -> State:
@@ -537,12 +541,15 @@ def names_coordinates(machine: AbstractMachine) -> bool:
 def labels_in(machine: AbstractMachine, state: State) -> tuple[str, str]:
     """Return the labels of position and velocity, which are the first components of a state by name
     if nothing else names them."""
-    names, labels = list(components(state)), machine.labels
+    labels = machine.labels
     own = overridden(machine, AbstractMachine, "position") is not None
     if labels != PLAIN or own or stops_of(machine) or hasattr(state, "Y"):
         return labels
-    named = [x for x in names if x[:1].isalpha()]
-    return (named[0], named[:2][-1]) if named else labels
+    named = [x for x in components(state) if x[:1].isalpha()][:2]
+    if not named:
+        return labels
+    in_array = ["[" in x for x in named]
+    return named[0], named[-1] if in_array[-1] == in_array[0] else named[0]
 
 
 def renews(machine: AbstractMachine) -> bool:

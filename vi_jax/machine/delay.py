@@ -189,6 +189,13 @@ def _reading_kind(kind: type, past: type[Past]) -> type:
         whose = f"`averages` of a {kind.__name__}"
         return _called(without_past(self).averages, whose, (), self, s, state, modes)
 
+    def observed_every(self: Any, interval: Any) -> Any:
+        return reading(without_past(self).observed_every(interval), self._past)
+
+    def observed_machine(self: Any) -> Any:
+        machine: Any = without_past(self)
+        return reading(machine.observed_machine, self._past)
+
     def parts(name: str) -> property:
         return property(lambda self: tuple(map(_given_past, getattr(without_past(self), name))))
 
@@ -200,7 +207,10 @@ def _reading_kind(kind: type, past: type[Past]) -> type:
         "field": field,
         "_switches": parts("_switches"),
         "_others": parts("_others"),
+        "observed_every": observed_every,
     }
+    if hasattr(kind, "observed_machine"):
+        body["observed_machine"] = property(observed_machine)
     if overridden(object.__new__(kind), AbstractMachine, "averages"):
         body["averages"] = averages
     return type(kind)(kind.__name__, (kind,), body | past.members(kind))

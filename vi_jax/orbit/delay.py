@@ -16,6 +16,7 @@ from ..machine import (
     has_delays,
     history_in,
     in_rows,
+    is_autonomous,
     longest_delay,
     machine_of_chain,
     modes_of,
@@ -50,7 +51,7 @@ def with_delay_error(orbit: Orbit) -> Orbit:
     """Return a single orbit of a chain with its difference from a run with the whole history."""
     chain: Any = orbit.machine
     machine = machine_of_chain(chain)
-    if machine is None or isinstance(orbit.residual, Tracer):
+    if machine is None or any(isinstance(x, Tracer) for x in jax.tree.leaves(orbit)):
         return orbit
     if orbit.residual.ndim or not bool(orbit.successful):
         return orbit
@@ -65,7 +66,11 @@ def with_delay_error(orbit: Orbit) -> Orbit:
         periods += int(min(np.log(SAME) / np.log(max(largest, 1e-3)), _MOST_PERIODS))
     own = chain._past.own(state)
     start = HybridState(own, modes_of(orbit.state) or (), history)
-    run = simulate(machine, start, periods * cycles, method=orbit.method, record="sections")
+    record = "motion" if is_autonomous(chain, state) else "sections"
+    run = simulate(machine, start, periods * cycles, method=orbit.method, record=record)
     last, row = in_rows(run.sections)[-1], in_rows(own, 0)
     error = distance(last, row, row_sizes(chain, state)[: row.size])
+    if run.duration is not None:  # on a section one number of the state is always the same
+        duration = jnp.sum(run.duration[-cycles:])
+        error = jnp.maximum(error, jnp.abs(duration / orbit.duration - 1))
     return dataclasses.replace(orbit, delay_error=error)

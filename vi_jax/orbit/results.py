@@ -239,7 +239,8 @@ class Orbit(Summarized):
     """The machine's own modes on the sections (see `AbstractMachine.modes`)."""
     delay_error: Float[Array, ""] | None = None
     """Of a machine with delays: the difference of the state from that of a run with the whole
-    history, which a stable motion settles on, relative to the size of each component."""
+    history, which a stable motion settles on, relative to the size of each component; or that of
+    the duration, relative to it, if it is larger."""
 
     @property
     @by_numpy_if_known

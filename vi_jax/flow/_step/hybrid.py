@@ -145,7 +145,7 @@ def _is_equilibrium_on_section(plan: Plan, lane: Lane, arrived: Lane) -> Flag:
     is_still = (arrived.s >= 2 * cycle) & (arrived.s - lane.s >= _LONG * cycle)
     for before, after, size in zip(old, new, sizes, strict=True):
         is_still = is_still & jnp.all(jnp.abs(after - before) <= slack * (size + jnp.abs(before)))
-        share = share + jnp.max(jnp.abs(after)) / size
+        share = share + jnp.max(jnp.abs(after) / size)
     guard = jnp.asarray(section_in(plan.machine, stop_gradient(arrived.state)))
     extent = plan.guard_extent(section_number(plan.machine), lane)
     return is_still & (jnp.abs(guard) <= slack * share * extent)
