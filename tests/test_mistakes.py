@@ -429,6 +429,10 @@ class Driving(Machine):
     contacts = (vi.DryFriction(0.1, on="V", load=lambda x: -9.81),)
 
 
+class DrivingLater(Machine):
+    contacts = (vi.DryFriction(0.1, on="V", load=lambda s, x: jnp.cos(s)),)
+
+
 class Spare(Machine):
     events = vi.Switch(lambda m, s, x, side: x.V)
 
@@ -497,6 +501,7 @@ def test_a_method_without_its_return(base, member):
         (lambda: simulate(OnNothing()), "OnNothing must be given: `on='x'`, or another of"),
         (lambda: simulate(RowOfForces()), "its rate of v.x has shape (1,), not ()"),
         (lambda: simulate(Driving()), "must not be negative, but is -0.981 at the start"),
+        (lambda: simulate(DrivingLater()), "9 at t = 3.14296, in the state of the start"),
         (lambda: simulate(PushedPosition()), "must be the name of a velocity"),
         (lambda: Method(1.0), "'velocity' of a Method must have another name"),
         (number_as_method, "'relaxation' of a Decay must have another name, since it is a method"),

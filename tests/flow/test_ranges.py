@@ -114,6 +114,32 @@ def test_parameters_out_of_range_fail_the_run():
         code(jnp.asarray(-0.04))
 
 
+class Coupled(vi.Mechanical):
+    """Two bodies whose masses are coupled."""
+
+    q = ("x", "y")
+    first: float = 1.0
+    coupling: float = 0.0
+    cycle: float = 1.0
+
+    def mass(self, q):
+        return [[self.first, self.coupling], [self.coupling, 1.0]]
+
+    def force(self, t, q, v):
+        return dict(x=-q.x, y=-q.y)
+
+
+def test_masses_and_cycles_of_a_batch_must_be_positive():
+    """Regression: lanes with a negative or indefinite mass were successful, and at x = -218."""
+
+    def result(first, coupling, cycle):
+        machine = Coupled(first=first, coupling=coupling, cycle=cycle)
+        return vi.simulate(machine, machine.at(x=1.0), 2).result
+
+    found = jax.vmap(result)(*jnp.array([[1, 0, 1], [-1, 0, 1], [1, 1.5, 1], [1, 0, -1.0]]).T)
+    assert (found == vi.RESULTS.bad_start).tolist() == [False, True, True, True]
+
+
 @pytest.mark.filterwarnings("ignore:vi_jax is running in single precision")
 def test_single_precision_limits_counts():
     with jax.enable_x64(False):

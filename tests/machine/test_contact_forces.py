@@ -35,6 +35,49 @@ def test_a_pushed_block_slides_or_tips():
     assert float(found["right"].tangential[2]) == pytest.approx(drag, abs=1e-12)
 
 
+class Leaning(vi.Mechanical):
+    """A rod of length 1 that leans on a wall."""
+
+    q = ("x", "y", "angle")
+    mass = (2.0, 2.0, 2.0 / 12)
+    cycle = 0.5
+
+    @property
+    def contacts(self):
+        sides = dict(
+            floor=(lambda q: q.y - 0.5 * jnp.sin(q.angle), lambda q: q.x + 0.5 * jnp.cos(q.angle)),
+            wall=(lambda q: q.x - 0.5 * jnp.cos(q.angle), lambda q: q.y + 0.5 * jnp.sin(q.angle)),
+        )
+        return tuple(
+            vi.RigidStop(0.0, 0.0, "left", on=gap, friction=0.5, along=place, name=name)
+            for name, (gap, place) in sides.items()
+        )
+
+    def force(self, t, q, v):
+        return dict(x=0.0, y=-2 * G, angle=0.0)
+
+
+def test_velocities_of_rounding_are_no_slip():
+    """Regression: a block that stood with v = 1e-16 slid, and a corner had more than its weight; a
+    rod that had come to lean on a wall did not touch it. Forces and moments balance."""
+    block = Block(HALF_WIDTH, HALF_HEIGHT, 0.3)
+    for speeds in (dict(x=1e-16), dict(tilt=1e-17), dict(x=-1e-16, y=1e-17, tilt=-1e-16)):
+        found = vi.contact_forces(block, block.at(y=HALF_HEIGHT, v=speeds))
+        for corner in found.values():
+            np.testing.assert_allclose(corner.normal, G / 2, rtol=1e-12)
+            assert abs(corner.tangential) < 1e-12
+    rod, angle = Leaning(), 1.3
+    start = rod.at(x=0.5 * np.cos(angle), y=0.5 * np.sin(angle), angle=angle)
+    for state in (start, vi.simulate(rod, start, 7).last):
+        found = vi.contact_forces(rod, state)
+        floor, wall = found["floor"], found["wall"]
+        assert abs(floor.normal + wall.tangential - 2 * G) < 1e-12
+        assert abs(floor.tangential + wall.normal) < 1e-12
+        across, up = np.cos(angle), np.sin(angle)
+        moment = (floor.normal - wall.tangential) * across + (floor.tangential - wall.normal) * up
+        assert abs(moment) < 1e-12 and min(floor.normal, wall.normal) > 1
+
+
 class Several(vi.AbstractMachine):
     """A body on a soft stop, with dry friction."""
 

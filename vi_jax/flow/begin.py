@@ -7,12 +7,14 @@ import jax.tree_util as jtu
 
 from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
+    Mechanical,
     begin_modes,
     chosen_stop,
     frictions_in,
     has_contact_friction,
     holds_anywhere,
     is_compound,
+    is_definite,
     is_in_range,
     on_held_surfaces,
     pressed_contacts,
@@ -37,7 +39,9 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     bad = bad | ~is_in_range(machine, start)
     for number in jtu.tree_leaves(eqx.filter(machine, eqx.is_inexact_array)):
         bad = bad | jnp.any(jnp.isnan(number))  # infinite is allowed: no limit
-    bad = bad | plan.beyond_a_stop(start)
+    bad = bad | plan.beyond_a_stop(start) | (jnp.asarray(machine.cycle) <= 0)
+    if isinstance(machine, Mechanical):
+        bad = bad | ~is_definite(machine._masses(machine._places(start)))
     bad = jax.lax.stop_gradient(bad)
     zero = jnp.zeros_like(Y)
     s = zero if plan.begin is None else zero + plan.begin

@@ -423,28 +423,33 @@ def _check_is_velocity(machine: AbstractMachine, on: str, s: Scalar, state: Stat
 
 
 def _check_friction_forces(machine: AbstractMachine, start: State) -> None:
-    """**Raises:** `ValueError` if the force of a friction is negative at the start."""
+    """**Raises:** `ValueError` if the force of a friction is negative in the state of the start, at
+    some instant of a cycle."""
     for number, friction in enumerate(switches_of(machine)):
         if not isinstance(friction, DryFriction) or not (callable(friction.level) or friction.load):
             continue
         try:
             with outside_of_traces():
-                force = float(_friction_force(machine, number, start))
+                forces, instants = map(np.asarray, _friction_forces(machine, number, start))
         except Exception:  # the error is raised with a better message when the friction is traced
             return
-        if force < 0:
+        least = np.argmin(forces)
+        if forces[least] < -1e-9 * np.abs(forces).max():
+            when = f"at t = {instants[least]:.6g}, in the state of " if instants[least] else "at "
             raise ValueError(
                 f"The force of a DryFriction of a {type(machine).__name__} must not be negative, "
-                f"but is {force:.6g} at the start. `level` and `load` are its size: it acts "
-                "against the slip by itself."
+                f"but is {forces[least]:.6g} {when}the start. `level` and `load` are its size: it "
+                "acts against the slip by itself."
             )
 
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
-def _friction_force(machine: AbstractMachine, number: int, start: State) -> Any:
+def _friction_forces(machine: AbstractMachine, number: int, start: State) -> Any:
     friction: Any = switches_of(machine)[number]
     zero = jnp.zeros_like(machine.position(start))
-    return friction.sliding(machine, zero, start, friction.slip_sign(machine, zero, start))
+    sign = friction.slip_sign(machine, zero, start)
+    s = zero + jnp.asarray(machine.cycle, float) * (np.arange(_INSTANTS) / _INSTANTS)
+    return jax.vmap(lambda s: friction.sliding(machine, s, start, sign) + 0 * s)(s), s
 
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore

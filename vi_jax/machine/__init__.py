@@ -42,7 +42,7 @@ from .leaves import (
     by_name, check_again, check_leaf, check_name, components, first_few, in_rows, leaf, leaf_names,
     near_names, size_by, size_of, with_leaf, with_leaves,
 )
-from .mechanical import Mechanical, solved
+from .mechanical import Mechanical, is_definite, solved
 from .modes import (
     HybridState, begun, constant_modes, history_of, modes_at_start, modes_of, own_modes, raveled,
     replaced, with_modes, without_modes,

@@ -1,14 +1,17 @@
 """The forces of contacts in a given state: of rests, soft stops and dry friction."""
 
+from functools import partial
 from math import pi
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from .. import lanes
 from .._types import Flag, Machine, Scalar, State
-from .contacts import field_in, velocity_change
+from .contacts import contact_constraints, field_in, push_gains, velocity_change
 from .events import begin_modes
 from .friction import frictions_in, settled_forces
 from .leaves import size_of
@@ -39,7 +42,14 @@ def contact_forces(machine: Any, state: State, t: Any = 0.0) -> dict[str, Named]
     contacts, such as the fourth leg of a table, are one of many possible choices.
     """
     own, state = modes_of(state), jtu.tree_map(lambda x: 1.0 * jnp.asarray(x), without_modes(state))
-    s = jnp.asarray(t, float)
+    numbers, rest = eqx.partition(machine, eqx.is_array)
+    # By a kernel: XLA compiles the forces of two corners four times as long.
+    return lanes.once(partial(_forces, rest), (numbers, jnp.asarray(t, float), state, own))
+
+
+def _forces(rest: Machine, inputs: tuple[Machine, Scalar, State, Any]) -> dict[str, Named]:
+    numbers, s, state, own = inputs
+    machine: Any = eqx.combine(numbers, rest)
     modes = begin_modes(machine, s, state, own)
     contact, slips, holds = closed_contacts(machine, s, state, modes)
     found: dict[str, Named] = {}
@@ -75,25 +85,43 @@ def closed_contacts(machine: Machine, s: Scalar, state: State, modes: Any) -> tu
     greatest force without slip relative to that of a slipping body."""
     indices, switches = frictions_in(machine), switches_of(machine)
     free = tuple(0.0 * x if i in indices else x for i, x in enumerate(modes))
-    flow, unit = field_in(machine, s, state, free), jnp.asarray(machine.cycle) / (2 * pi)
+    contact = [jnp.zeros_like(s) for _ in machine.coordinates] if stops_of(machine) else []
+    held = contact_constraints(machine, s, state, free, contact)
+    changes, unit = _changes(machine, s, state, free, held), jnp.asarray(machine.cycle) / (2 * pi)
     sizes = jtu.tree_map(jnp.abs, state)
 
     def is_small(part: Any, change: Scalar) -> Flag:
-        return jnp.abs(part(state)) <= _RESTS * (size_of(part, state, sizes) + jnp.abs(change))
+        return jnp.abs(part(state)) <= _RESTS * (size_of(part, state, sizes) + change)
 
-    contact = [jnp.zeros_like(s) for _ in machine.coordinates] if stops_of(machine) else []
     for number, stop in enumerate(stops_of(machine)):
-        body = machine.coordinates[stop.coordinate]
-        force = velocity_change(body, state, flow)
-        near = is_small(lambda x, f=stop, b=body: f.beyond(b.position(x)), unit**2 * force)
-        rests = near & is_small(body.velocity, unit * force)
         k = stop.coordinate
-        contact[k] = jnp.where(rests, 1.0 + number, contact[k])
-    slips, holds = [], []
+        body, change = machine.coordinates[k], unit * changes[limited_in(machine).index(k)]
+        near = is_small(lambda x, f=stop, b=body: f.beyond(b.position(x)), unit * change)
+        contact[k] = jnp.where(near & is_small(body.velocity, change), 1.0 + number, contact[k])
+    slips, holds, rows = [], [], [i for i, *_ in held.stop_frictions] + held.dry
     for i in indices:
-        friction = switches[i]
+        friction, change = switches[i], changes[len(held.rows) - len(rows) + rows.index(i)]
         speed = lambda x, f=friction: f.speed_of_slip(machine, s, x)
-        still = is_small(speed, unit * friction.slip_rate(machine, s, state, flow))
+        still = is_small(speed, unit * change)
         slips.append(jax.lax.stop_gradient(jnp.where(still, 0.0, jnp.sign(speed(state)))))
         holds.append(getattr(friction, "static_ratio", 1.0) + jnp.zeros_like(s))
     return tuple(contact), tuple(slips), tuple(holds)
+
+
+def _changes(machine: Machine, s: Scalar, state: State, free: Any, held: Any) -> list[Scalar]:
+    """Return a size of the rate of each row's velocity, by which rounding is judged: that of the
+    force without contacts, of the friction that it may cause, and of the other rows' pushes. A
+    block that stands has no other size along the floor."""
+    switches, dry = switches_of(machine), len(held.rows) - len(held.dry)
+    flow = field_in(machine, s, state, free)
+    rates = [velocity_change(body, state, flow) for body in held.coordinates[:dry]]
+    rates += [switches[i].slip_rate(machine, s, state, flow) for i in held.dry]
+    rates = [jnp.abs(x) for x in rates]
+    for n, (_, friction, stop, _) in enumerate(held.stop_frictions, dry - len(held.stop_frictions)):
+        pressed = rates[stop] * held.rows[stop].mass / held.rows[n].mass
+        rates[n] = rates[n] + friction.level * pressed
+    for n, i in enumerate(held.dry, dry):
+        level = switches[i].sliding(machine, s, state, jnp.zeros_like(s))
+        rates[n] = rates[n] + level / held.rows[n].mass
+    gains = push_gains(held.coordinates, held.rows, state, held.pushes)
+    return [sum(jnp.abs(x) * rate for x, rate in zip(row, rates, strict=True)) for row in gains]

@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 
 from .._checks import concrete, returned
-from .._types import Scalar, State
+from .._types import Flag, Scalar, State
 from ..lanes import dependent_results
 from .base import AbstractMachine, cached_in_trace, contacts_in
 from .contacts import check_takes
@@ -501,14 +501,8 @@ def _is_mass(x: Any, shape: tuple[int, ...]) -> bool:
 def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:
     """Return M⁻¹ right for a symmetric positive definite matrix, by elimination without pivoting,
     omitting zeros. Pivots are inverted: those of constant masses do not change in a step."""
-    n, rows, inverses = len(right), [[*row, x] for row, x in zip(M, right, strict=True)], []
-    for i in range(n):
-        inverses.append(1 / rows[i][i])
-        for k in range(i + 1, n):
-            if _is_zero(rows[k][i]):
-                continue
-            ratio = rows[k][i] * inverses[i]
-            rows[k] = [_minus_product(a, ratio, b) for a, b in zip(rows[k], rows[i], strict=True)]
+    rows, inverses = _eliminated([[*row, x] for row, x in zip(M, right, strict=True)])
+    n = len(rows)
     found: list[Any] = [0.0] * n
     for i in reversed(range(n)):
         value = rows[i][n]
@@ -516,6 +510,25 @@ def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:
             value = _minus_product(value, rows[i][j], found[j])
         found[i] = 0.0 if _is_zero(value) else _times(inverses[i], value)
     return found
+
+
+def is_definite(M: Matrix) -> Flag:
+    """Return whether a symmetric matrix is positive definite, by the pivots of elimination."""
+    flags = [jnp.all(jnp.asarray(x) > 0) for x in _eliminated([[*row] for row in M])[1]]
+    return functools.reduce(operator.and_, flags)
+
+
+def _eliminated(rows: list[list[Any]]) -> tuple[list[list[Any]], list[Any]]:
+    """Return the rows of a matrix, with right sides, after elimination; and the inverse pivots."""
+    n, inverses = len(rows), []
+    for i in range(n):
+        inverses.append(1 / rows[i][i])
+        for k in range(i + 1, n):
+            if _is_zero(rows[k][i]):
+                continue
+            ratio = rows[k][i] * inverses[i]
+            rows[k] = [_minus_product(a, ratio, b) for a, b in zip(rows[k], rows[i], strict=True)]
+    return rows, inverses
 
 
 def _minus_product(x: Any, factor: Any, y: Any) -> Any:
