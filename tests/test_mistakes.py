@@ -453,7 +453,7 @@ def test_a_method_without_its_return(base, member):
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: simulate(Blind()), "`guard` of a Reset of a Blind must take the machine, `t`, the state and 1 mode"),
+        (lambda: simulate(Blind()), "of a Blind must take the machine, `t`, the state and 1 mode"),
         (
             lambda: simulate(Spare()),
             "of a Switch of a Spare must take the machine, `t`, the state, but takes `m`, `s`, `x`",
