@@ -161,11 +161,6 @@ def own_private_method():
             return ()
 
 
-class NoReturn(Machine):
-    def field(self, s, x):
-        vi.OscillatorState(x.V, -x.Y)
-
-
 class Tuple(Machine):
     def field(self, s, x):
         return x.V, -x.Y
@@ -257,9 +252,9 @@ def test_8_an_if_on_a_traced_number():
 
 
 def test_9_a_field_that_returns_no_state():
-    nothing, row = (refused(lambda kind=kind: simulate(kind())) for kind in (NoReturn, Tuple))
-    assert "its `return` is missing" in nothing and "but returned (f64[], f64[])" in row
-    assert all("must return the components of its state" in said for said in (nothing, row))
+    said = refused(lambda: simulate(Tuple()))
+    assert "must return the components of its state" in said
+    assert "but returned (f64[], f64[])" in said
 
 
 def test_10_a_guess_far_from_stable_motion():
@@ -377,6 +372,31 @@ def test_a_parameter_of_a_ready_machine_is_read_there():
     assert not warned(lambda: check_leaf(Unlimited(), "damping"))
 
 
+class Turning(Machine):
+    cycle = vi.turn_of("psi")
+
+
+class TurningInSeconds(Masses):
+    cycle = vi.turn_of("psi", usual=6.0)
+
+
+class Rising(Machine):
+    cycle = vi.rising(lambda m, z: z.psi, usual=6.0)
+
+
+class Renews(Harmonic):
+    def renewed(self, z):
+        z.replace(x=0.0)
+
+
+class SlipOfNothing(RubsPosition):
+    contacts = vi.DryFriction(0.1, on="u", slip=lambda z: None)
+
+
+class GapOfNothing(Masses):
+    contacts = vi.RigidStop(1.0, 0.5, on=lambda q: None)
+
+
 class OnNothing(Masses):
     contacts = vi.SoftStop(0.1, 9.0)
 
@@ -418,12 +438,25 @@ class Spare(Machine):
 
 
 @pytest.mark.parametrize(
+    ("base", "member"),
+    [(Machine, x) for x in ("field", "start", "step_limit", "averages", "quantities")]
+    + [(Masses, x) for x in ("force", "mass", "prescribed", "start")],
+)
+def test_a_method_without_its_return(base, member):
+    kind = type("Forgetful", (base,), {member: lambda self, *args: None})
+    with warnings.catch_warnings(action="error"):
+        said = refused(lambda: vi.simulate(kind(), cycles=1))
+    assert said.startswith(f"`{member}` of a Forgetful must return ")
+    assert said.endswith(", but its `return` is missing.")
+
+
+@pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: simulate(Blind()), "`guard` of a Reset of a Blind must take the machine, `s`"),
+        (lambda: simulate(Blind()), "of a Blind must take the machine, `t`, the state and 1 mode"),
         (
             lambda: simulate(Spare()),
-            "of a Switch of a Spare must take the machine, `s`, the state, but takes `m`, `s`, `x`",
+            "of a Switch of a Spare must take the machine, `t`, the state, but takes `m`, `s`, `x`",
         ),
         (lambda: NoType(stiffness=3.0), "in the class, `stiffness: float = 2.0`"),
         (lambda: Machine(omegga=1.0), "`Machine` has no argument `omegga`; near names: omega"),
@@ -438,9 +471,15 @@ class Spare(Machine):
             "`start` must be one state (use `jax.vmap` for a batch), but its x has shape (2,)",
         ),
         (lambda: simulate(VelocityInPlaces()), "`q` has the positions and `v` the velocities"),
-        (lambda: simulate(AveragesOfForces()), "must take `s`, the state, but takes `t`, `q`, `v`"),
+        (lambda: simulate(AveragesOfForces()), "must take `t`, the state, but takes `t`, `q`, `v`"),
         (lambda: simulate(WithoutSpeed()), "must take `t`, `q`, `v`, but takes `t`, `q`"),
         (lambda: simulate(Assigns()), "must return new numbers"),
+        (lambda: simulate(Turning()), "`cycle` of a Turning must name one of the components Y, V"),
+        (lambda: simulate(TurningInSeconds()), "x, w, v.x, v.w, but names 'psi'"),
+        (lambda: simulate(Rising()), "`cycle` of a Rising must be computable, but: "),
+        (lambda: simulate(Renews()), "`renewed` of a Renews must be like its state, State(x, u)"),
+        (lambda: vi.simulate(SlipOfNothing(), cycles=1), "`slip` of a DryFriction of a SlipOf"),
+        (lambda: simulate(GapOfNothing()), "must return a number, but its `return` is missing"),
         (lambda: simulate(CycleByZero()), "`cycle` of a CycleByZero must be finite, but divides"),
         (lambda: simulate(CycleInWords()), "must be a number, or a property that gives one, but"),
         (lambda: simulate(WithUnits()), "but has 'spede'; near names: speed"),
@@ -454,7 +493,7 @@ class Spare(Machine):
         (lambda: vi.simulate(Masses(), vi.State(x=0.0, w=0.0), 1), "a state with x, w, v.x, v.w"),
         (lambda: simulate(ByNumber()), "must return positions by name, `dict(w=...)`"),
         (lambda: simulate(OtherGap()), "must be a function of the coordinates: The state has no"),
-        (lambda: simulate(WithoutMode()), "must take `t`, `q`, `v` and 1 modes"),
+        (lambda: simulate(WithoutMode()), "must take `t`, `q`, `v` and 1 mode "),
         (lambda: vi.SoftStop(0.1, 9.0, restitution=0.5, dashpot=1.0), "`dashpot` must be left out"),
         (lambda: vi.simulate(RubsPosition(), cycles=1), "its rate is 'u'. Write `on='u'`"),
         (lambda: vi.simulate(RubbedByIf(), cycles=1), "`level` or `load` of a DryFriction of a"),

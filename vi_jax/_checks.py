@@ -241,6 +241,14 @@ def instance_of(name: str, value: object, kind: type | tuple[type, ...], describ
     raise TypeError(f"Argument `{name}` must be {described}, but got {got}.")
 
 
+def returned(found: Any, whose: str, what: str) -> Any:
+    """Return the result of a user's function. **Raises:** `TypeError` if it is `None`: the function
+    `whose` must return `what`."""
+    if found is None:
+        raise TypeError(f"{whose} must return {what}, but its `return` is missing.")
+    return found
+
+
 def short(value: object) -> str:
     """Return the first line of the value's `repr`, with an ellipsis if there are more."""
     first, *more = repr(value).splitlines() or [""]

@@ -359,7 +359,7 @@ def test_refusals_name_what_is_wrong():
     ):
         with pytest.raises(ValueError, match=words):
             vi.simulate(machine, **options)
-    with pytest.raises(TypeError, match="must take the machine, `s`, the state, the past"):
+    with pytest.raises(TypeError, match="must take the machine, `t`, the state, the past"):
         vi.simulate(WithoutPast())
     with pytest.raises(TypeError, match=r"needs the chain as its machine, .* `orbit.machine`"):
         vi.simulate(Struck(), vi.delay_chain(Struck()).start())

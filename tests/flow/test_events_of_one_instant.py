@@ -175,7 +175,7 @@ def test_last_state_keeps_its_modes():
     np.testing.assert_allclose(found, whole.sections[0][1:], rtol=1e-13)
     np.testing.assert_allclose(found[-1], heated(300.0, 12 * 0.37), rtol=1e-11)
     assert state.modes == (whole.modes[0][-1],)
-    with pytest.raises(ValueError, match="1 modes, one number each"):
+    with pytest.raises(ValueError, match="1 mode, a number each"):
         vi.simulate(furnace, vi.HybridState((jnp.asarray(300.0),), (0.0, 1.0)), 1)
 
 

@@ -55,8 +55,8 @@ class Clockless(BouncingBall):
 @pytest.mark.parametrize(
     ("kind", "told"),
     [
-        (Swapped, "`field` of a Swapped must take `s` first and then the state"),
-        (Clockless, "`field` of a Clockless must take `s`, the state, but takes `"),
+        (Swapped, "`field` of a Swapped must take `t` first and then the state"),
+        (Clockless, "`field` of a Clockless must take `t`, the state, but takes `"),
     ],
 )
 def test_field_with_other_arguments_raises(kind, told):

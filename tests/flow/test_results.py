@@ -110,8 +110,11 @@ def test_reasons_print_their_names():
 
     found = jax.vmap(one)(jnp.asarray([1.0, -1.0]))
     assert str(found) == "RESULTS[successful, bad_start]"
-    first = jax.tree.map(lambda x: x[0], found)
+    first = found[0]
     assert repr(first) == repr(vi.RESULTS.successful) == "RESULTS.successful"
+    assert [vi.RESULTS[x] for x in found] == ["", vi.RESULTS[found[-1]]] != ["", ""]
+    with pytest.raises(TypeError, match="must get one lane, but got 2"):
+        vi.RESULTS[found]
     assert str(pickle.loads(pickle.dumps(first))) == "RESULTS.successful"
     np.testing.assert_array_equal(found == vi.RESULTS.bad_start, [False, True])
     many = jax.tree.map(lambda x: jnp.tile(x, (20, 1)), found)

@@ -15,7 +15,7 @@ from jax.extend.core import Jaxpr
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from .._checks import concrete, fields_with, outside_of_traces
+from .._checks import concrete, fields_with, outside_of_traces, returned
 from .._types import Scalar, State
 from ..lanes import called, propagate_marks
 from ..machine import (
@@ -132,7 +132,7 @@ def _checked_names(
     """Return the names of a machine's averages or quantities (`attribute`), sorted; names of
     components of `start` are in use already. **Raises:** as `average_names`."""
     label = f"`{attribute}` of a {type(machine).__name__}"
-    check_takes(function, label, "`s`, the state", arguments, len(arguments) - 2)
+    check_takes(function, label, "`t`, the state", arguments, len(arguments) - 2)
     with explain_errors(label):
         found = jax.eval_shape(lambda *x: _as_arrays(label, function(*x)), *arguments)
     taken = _RESERVED | set(leaf_names(machine)) | set(components(start))
@@ -146,8 +146,8 @@ def _checked_names(
     return tuple(sorted(found))  # in the order of pytrees
 
 
-def _as_arrays(label: str, found: object) -> dict[str, Array]:
-    if not isinstance(found, Mapping):
+def _as_arrays(label: str, found: Any) -> dict[str, Array]:
+    if not isinstance(returned(found, label, "numbers by name"), Mapping):
         raise TypeError(
             f"{label} must be a mapping of names to numbers, but returned {type(found).__name__}."
         )

@@ -27,11 +27,12 @@ from .._checks import (
     require_ranges,
     require_real,
     require_session,
+    returned,
     short,
     strongly_typed,
     warn_of_narrow,
 )
-from .._messages import warn
+from .._messages import count_of, warn
 from .._types import Machine, State
 from ..machine import (
     AbstractMachine,
@@ -39,7 +40,6 @@ from ..machine import (
     Turn,
     begin_modes,
     check_takes,
-    component,
     components,
     contacts_in,
     convert_start,
@@ -220,8 +220,8 @@ def _own_modes(machine: AbstractMachine, start: State, modes: Any, dtype: Any) -
     wanted = jax.eval_shape(lambda x: modes_at_start(machine, jnp.zeros((), dtype), x), start)
     if len(modes) != len(wanted) or any(jnp.shape(mode) for mode in modes):
         raise ValueError(
-            f"Argument `start` must have {len(wanted)} modes, one number each, as many as a "
-            f"{type(machine).__name__} has, but has {tuple(modes)}."
+            f"Argument `start` must have {count_of(len(wanted), 'mode')}, a number each, as many "
+            f"as a {type(machine).__name__} has, but has {tuple(modes)}."
         )
     return tuple(jnp.asarray(mode, dtype) for mode in modes)
 
@@ -308,7 +308,7 @@ def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
     try:
         check_before_modes(machine, jnp.zeros(()), state)
         modes = shown_modes(machine, begin_modes(machine, jnp.zeros(()), state))
-        check_takes(machine.field, whose, "`s`, the state", (0.0, state, *modes), len(modes))
+        check_takes(machine.field, whose, "`t`, the state", (0.0, state, *modes), len(modes))
         rate = lambda s, x: field_in(machine, s, x, begin_modes(machine, s, x))
         with explain_errors(whose):
             jax.eval_shape(rate, jnp.zeros(()), state)
@@ -354,6 +354,7 @@ def check_finite(argument: str, state: State) -> None:
 def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int, ...]:
     """Return the shape of position and velocity in a state, `()` in a single one. **Raises:**
     `TypeError` for an invalid state of this machine."""
+    returned(state, f"`start` of a {type(machine).__name__}", "a state")  # others are not `None`
     check_reals(argument, state)
     if isinstance(machine, Mechanical):
         q = machine._q_shapes
@@ -405,7 +406,7 @@ def _check_turn(machine: AbstractMachine, start: State) -> None:
     counter = counter_of(machine)
     if not isinstance(counter, Turn):
         return
-    angle, begin = concrete(component(counter.name, start)), concrete(counter.start)
+    angle, begin = concrete(counter.value(machine, start)), concrete(counter.start)
     beyond = None if angle is None or begin is None else angle - begin - 2 * np.pi
     if beyond is not None and np.any(beyond > -1e-9):  # rounding
         raise ValueError(

@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from .._checks import concrete, named_leaves, outside_of_traces
+from .._checks import concrete, named_leaves, outside_of_traces, returned
 from .._messages import warn
 from .._types import Scalar, Scalars, State
 from ..lanes import dependent_results
@@ -46,6 +46,7 @@ from ..machine import (
     listed,
     others_of,
     outcomes_of,
+    overridden,
     section_in,
     shown_modes,
     stops_of,
@@ -76,7 +77,7 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
     member = "`force` or `mass`" if isinstance(machine, Mechanical) else "`field`"
     label = f"{member} of a {type(machine).__name__}"
     modes = shown_modes(machine, modes)
-    check_takes(machine.field, label, "`s`, the state", (s, state, *modes), len(modes))
+    check_takes(machine.field, label, "`t`, the state", (s, state, *modes), len(modes))
 
     def checked_field(s, state, *modes):
         found = machine.field(s, state, *modes)
@@ -88,17 +89,14 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
     except (AttributeError, TypeError, LookupError) as error:
         if _is_traceable(machine.field, state, s, *modes):
             raise TypeError(
-                f"{label} must take `s` first and then the state, but takes them the other way "
+                f"{label} must take `t` first and then the state, but takes them the other way "
                 "round."
             ) from None
         if isinstance(error, TypeError):  # it says what must be
             raise
         names = " In `force`, `q` has the positions and `v` the velocities." * ("mass" in member)
         raise TypeError(f"{label} cannot be computed: {error}{names}") from error
-    if flow is None:
-        raise TypeError(
-            f"{label} must return the components of its state, but its `return` is missing."
-        )
+    returned(flow, label, "the components of its state")
     if jtu.tree_structure(state) != jtu.tree_structure(flow):
         raise TypeError(
             f"{label} must return the components of its state, {tree_text(state)}, but returned "
@@ -341,7 +339,7 @@ def _check_frictions(machine: AbstractMachine, s: Scalar, state: State) -> None:
             try:
                 with explain_errors(label):
                     jax.eval_shape(lambda x, f=function: jnp.asarray(f(machine, s, x)), state)
-            except (AttributeError, LookupError, TypeError) as error:
+            except (AttributeError, LookupError, TypeError, ValueError) as error:
                 if str(error).startswith(label):
                     raise
                 raise TypeError(f"{label} must be computable, but: {error}") from None
@@ -644,7 +642,7 @@ def _check_gap(machine: Mechanical, gap: Callable[..., Any]) -> None:
     places = NamedState(**{name: np.zeros(shape) for name, shape in machine._q_shapes.items()})
     try:
         with explain_errors(label):
-            jax.eval_shape(gap, places)
+            returned(jax.eval_shape(gap, places), label, "a number")
     except AttributeError as error:
         raise TypeError(f"{label} must be a function of the coordinates: {error}") from None
 
@@ -718,6 +716,9 @@ def check_events(machine: AbstractMachine, s: Scalar, state: State, modes: Scala
         label = f"`placed` of coordinate {k} of a {name}"
         place, velocity = coordinate.position(state), coordinate.velocity(state)
         _check_state(label, state, _output_shapes(label, coordinate.placed, state, place, velocity))
+    if overridden(machine, AbstractMachine, "renewed"):
+        label = f"`renewed` of a {name}"
+        _check_state(label, state, _output_shapes(label, machine.renewed, state))
     first = len(stops_of(machine))
     for number, event in enumerate(events_of(machine)[first:-1], start=first):
         _check_event(machine, number, event, (s, state, modes))

@@ -2,8 +2,8 @@
 
 import difflib
 import enum
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Self
 
 import equinox as eqx
 import jax
@@ -36,9 +36,12 @@ from ..machine import (
 _MOST_LISTED = 8
 
 if TYPE_CHECKING:
-    from equinox import Enumeration as NamedEnumeration
-
     _Member: Any = None
+
+    class NamedEnumeration(eqx.Enumeration):
+        def __getitem__(self, place: Any) -> Self: ...
+        def __iter__(self) -> Iterator[Self]: ...
+
 else:
 
     class _Member(eqx.Module):
@@ -58,6 +61,12 @@ else:
 
         def __ne__(self, other):
             return ~(self == other)
+
+        def __getitem__(self, place):
+            return _Member(_at(self.number, place), self.kind)
+
+        def __iter__(self):  # Python's own would not end: JAX repeats the last lane
+            return (self[i] for i in range(len(self.number)))
 
         def __int__(self) -> int:
             name = self.kind.__name__
@@ -95,7 +104,13 @@ else:
             return isinstance(value, _Member) and value.kind is cls
 
         def __getitem__(cls, item):
-            return list(cls._texts.values())[int(getattr(item, "number", item))]
+            number = getattr(item, "number", item)
+            if np.ndim(number):
+                raise TypeError(
+                    f"`{cls.__name__}[...]` must get one lane, but got {np.size(number)}. Take the "
+                    f"text of each: `{cls.__name__}[run.result[0]]`."
+                )
+            return list(cls._texts.values())[int(number)]
 
         def __getattr__(cls, name: str) -> Any:
             if name.startswith("_"):
@@ -147,7 +162,7 @@ def member_of(kind: Any, number: Any) -> Any:
     return _Member(jnp.asarray(number, jnp.int32), kind)
 
 
-def _at(x: Any, place: tuple) -> Any:
+def _at(x: Any, place: Any) -> Any:
     """Return x[place], by NumPy if `x` is known and in this computer's memory."""
     in_memory = isinstance(x, jax.Array) and not isinstance(x, Tracer)
     if not in_memory or any(device.platform != "cpu" for device in x.devices()):

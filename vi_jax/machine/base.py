@@ -23,7 +23,7 @@ try:
 except ImportError:  # JAX 0.9
     from jax.core import get_opaque_trace_state  # pyright: ignore
 
-from .._checks import fields_with, number, require
+from .._checks import fields_with, number, require, returned
 from .._types import Machine, Scalar, State
 from .coordinates import Coordinate, coordinate_by_name
 from .cycles import Turn, at_intervals, counter_of, counts_turns
@@ -199,6 +199,7 @@ def names_on(machine: Machine, number: int) -> tuple[str, str] | None:
 def longest_step(machine: Machine, s: Scalar, state: State) -> Scalar | float:
     """Return the longest step from a state: the machine's `step_limit`, less near a soft stop."""
     limit = machine.step_limit(s, state)
+    limit = returned(limit, f"`step_limit` of a {type(machine).__name__}", "the longest step")
     for stop in switches_of(machine):
         if stop.acts and isinstance(stop, SoftStop):
             pace, length = machine.pace(s, state), stop.longest_step(machine, s, state)

@@ -18,6 +18,7 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array
 
+from .._messages import count_of
 from .._types import Flag, Machine, Scalar, Scalars, State
 from .coordinates import Row
 from .parts import friction_on, limited_in, stops_of, switches_of
@@ -308,7 +309,8 @@ def check_takes(
     try:
         signature.bind(*arguments)
     except TypeError as error:
-        and_modes = f" and {modes} modes (of switches, then the machine's own)" if modes else ""
+        number = count_of(modes, "mode")
+        and_modes = f" and {number} (of switches, then the machine's own)" if modes else ""
         takes = ", ".join(f"`{name}`" for name in signature.parameters) or "nothing"
         needed = [x.name for x in signature.parameters.values() if x.default is x.empty]
         more = needed[len(arguments) :] if "missing" in str(error) else []
@@ -325,7 +327,7 @@ def call_checked(function: Callable[..., Any], whose: str, *arguments: Any) -> A
     try:
         return function(*arguments)
     except TypeError:
-        check_takes(function, whose, "the machine, `s`, the state", arguments, len(arguments) - 3)
+        check_takes(function, whose, "the machine, `t`, the state", arguments, len(arguments) - 3)
         raise
 
 

@@ -11,10 +11,11 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._checks import concrete
+from .._checks import concrete, returned
 from .._types import Scalar, State
 from .coordinates import component, has_component, with_component, wrap_angles
 from .event import AbstractEvent, Section, TurnEnd
+from .leaves import components
 from .overrides import with_static
 
 
@@ -44,6 +45,20 @@ class Counter(abc.ABC):
     def section(self, machine: Any, state: State) -> Any:
         """Return the function that rises through zero at the end of a cycle."""
 
+    def value(self, machine: Any, state: State) -> Any:
+        """Return the component of the state, or the value of the function, that ends cycles.
+        **Raises:** `TypeError` if it cannot be computed."""
+        whose = f"`cycle` of a {type(machine).__name__}"
+        if not callable(self.name) and not has_component(self.name, state):
+            raise TypeError(
+                f"{whose} must name one of the components {', '.join(components(state))}, but "
+                f"names {self.name!r}."
+            )
+        try:
+            return self.name(machine, state) if callable(self.name) else component(self.name, state)
+        except (AttributeError, LookupError) as error:
+            raise TypeError(f"{whose} must be computable, but: {error}") from error
+
     def with_earlier_angle(self, state: State) -> State:
         """Return the state at the beginning of the next cycle."""
         return state
@@ -62,7 +77,9 @@ class Turn(Counter):
         """Return `usual`, or by default the duration of a turn at the speed of `start`."""
         if self.usual is not None:
             return super().length(machine)
-        speed = self.speed(machine.start())
+        start = returned(machine.start(), f"`start` of a {type(machine).__name__}", "a state")
+        self.value(machine, start)
+        speed = self.speed(start)
         known = None if speed is None else concrete(speed)
         if speed is None or (known is not None and not known.all()):
             raise ValueError(
@@ -85,7 +102,7 @@ class Turn(Counter):
         return 0.2 * usual / jnp.maximum(1.0, usual * jnp.abs(speed) / (2 * pi))
 
     def section(self, machine: Any, state: State) -> Any:
-        return component(self.name, state) - (self.start + 2 * pi)
+        return self.value(machine, state) - (self.start + 2 * pi)
 
     def with_earlier_angle(self, state: State) -> State:
         return with_component(self.name, state, component(self.name, state) - 2 * pi)
@@ -99,8 +116,7 @@ class Passing(Counter):
         self.sign = sign
 
     def section(self, machine: Any, state: State) -> Any:
-        function: Any = self.name
-        value: Any = function(machine, state) if callable(function) else component(function, state)
+        value = self.value(machine, state)
         return value if self.sign > 0 else -value
 
 

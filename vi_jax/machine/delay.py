@@ -223,7 +223,7 @@ def _called(
     """Return the result of a user's function, which receives the past after the state."""
     past = machine._past
     given = *first, s, past.own(state), past(machine, s, state), *modes
-    words = "the machine, `s`, the state, the past" if first else "`s`, the state, the past"
+    words = "the machine, `t`, the state, the past" if first else "`t`, the state, the past"
     check_takes(function, whose, words, given, len(modes))
     return function(*given)
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from .._checks import concrete
+from .._checks import concrete, returned
 from .._types import Flag, Scalar, State
 from ..lanes import dependent_results
 from .base import AbstractMachine, cached_in_trace, contacts_in
@@ -143,17 +143,16 @@ class Mechanical(AbstractMachine):
         """The names of the coordinates whose motion is not prescribed."""
         if type(self).prescribed is Mechanical.prescribed:
             return self._q_names
-        given = jax.eval_shape(self.prescribed, 0.0)
+        whose = f"`prescribed` of a {type(self).__name__}"
+        what = f"positions by name, `dict({self._q_names[-1]}=...)`"
+        given = returned(jax.eval_shape(self.prescribed, 0.0), whose, what)
         if not isinstance(given, Mapping):
-            raise TypeError(
-                f"`prescribed` of a {type(self).__name__} must return positions by name, "
-                f"`dict({self._q_names[-1]}=...)`."
-            )
+            raise TypeError(f"{whose} must return {what}.")
         unknown = [x for x in given if x not in self._q_names]
         if unknown:
             raise ValueError(
-                f"`prescribed` of a {type(self).__name__} returned {unknown[0]!r}, which is not "
-                f"one of the coordinates {', '.join(self._q_names)}."
+                f"{whose} returned {unknown[0]!r}, which is not one of the coordinates "
+                f"{', '.join(self._q_names)}."
             )
         return tuple(x for x in self._q_names if x not in given)
 
@@ -167,10 +166,10 @@ class Mechanical(AbstractMachine):
         except TypeError:
             check_takes(self.force, whose, "`t`, `q`, `v`", (t, q, v, *modes), len(modes))
             raise
-        applied = like(free, given, whose)
+        what = f"forces by name, `dict({', '.join(f'{name}=...' for name in names)})`"
+        applied = like(free, returned(given, whose, what), whose)
         if not isinstance(applied, Named):
-            by_name = ", ".join(f"{name}=..." for name in names)
-            raise TypeError(f"{whose} must return forces by name, `dict({by_name})`.")
+            raise TypeError(f"{whose} must return {what}.")
         known = {x: f for x, f in given.items() if _is_zero(f)} if isinstance(given, dict) else {}
         applied = vars(applied) | known
         both = zip(applied.values(), self._inertial(q, v), strict=True)
@@ -222,7 +221,11 @@ class Mechanical(AbstractMachine):
                 "the class or by a method `mass(self, q)`."
             )
         shapes = {name: self._q_shapes[name] for name in self._free_names}
-        return matrix_of(given(q) if callable(given) else given, shapes, type(self).__name__)
+        whose = type(self).__name__
+        if callable(given):
+            what = f"one for each of {', '.join(shapes)}"
+            given = returned(given(q), f"`mass` of a {whose}", what)
+        return matrix_of(given, shapes, whose)
 
     def _inertial(self, q: Named, v: Named) -> list[Any]:
         """Return h = dM/dt v - ½ ∂(vᵀMv)/∂q of Lagrange's equations; 0 with constant masses."""
