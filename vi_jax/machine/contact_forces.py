@@ -124,4 +124,5 @@ def _changes(machine: Machine, s: Scalar, state: State, free: Any, held: Any) ->
         level = switches[i].sliding(machine, s, state, jnp.zeros_like(s))
         rates[n] = rates[n] + level / held.rows[n].mass
     gains = push_gains(held.coordinates, held.rows, state, held.pushes)
-    return [sum(jnp.abs(x) * rate for x, rate in zip(row, rates, strict=True)) for row in gains]
+    sizes = [[jnp.abs(x) * rate for x, rate in zip(row, rates, strict=True)] for row in gains]
+    return [sum(row[1:], row[0]) for row in sizes]

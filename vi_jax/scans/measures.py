@@ -415,12 +415,12 @@ class Regime(AbstractMeasure):
     Otherwise it is transiently chaotic: it has settled meanwhile, or is about to. `REGIMES` has the
     numbers for these kinds in `period`.
 
-    The others and these are observed for another `averaged` cycles. They are quasi-periodic if averages over
-    both halves agree to many digits (see `Rotation`), the exponent is zero to the accuracy of that
-    time, and no section is the first one again; chaotic with few digits and a positive exponent;
-    else as before or unsettled, such as a motion with a period above `longest`. Quasi-periodic motions close to
-    a resonance, or with more than two frequencies, and those of machines without losses are mostly
-    called unsettled.
+    The others and these are observed for another `averaged` cycles. They are quasi-periodic if
+    averages over both halves agree to many digits (see `Rotation`), the exponent is zero to the
+    accuracy of that time, and no section is the first one again; chaotic with few digits and a
+    positive exponent; else as before or unsettled, such as a motion with a period above `longest`.
+    Quasi-periodic motions close to a resonance, or with more than two frequencies, and those of
+    machines without losses are mostly called unsettled.
 
     A chaotic transient looks like chaos while it lasts, so a motion called chaotic may still settle
     later. A longer `lasting` makes this rarer and chaotic lanes costlier; 0 omits the second pass,
