@@ -75,16 +75,14 @@ _ZERO = 1e-15
 def sizes_at_start(plan: "Plan", s: Scalar, start: State) -> tuple[Scalars, State, tuple[Any, ...]]:
     """Return the modes at the start, `Plan.sizes` and `Plan.extents`, by a kernel that all plans of
     a machine share."""
-    numbers, rest = eqx.partition(plan.machine, eqx.is_array)
-    given = stop_gradient((numbers, s, start, plan.start_modes))
-    return lanes.once(partial(_sizes_at_start, rest, plan.rests), given, backend=plan.backend)
+    given, find = stop_gradient((s, start, plan.start_modes)), partial(_sizes_at_start, plan.rests)
+    return lanes.once_with(_constant(plan.machine), find, given, backend=plan.backend)
 
 
 def _sizes_at_start(
-    rest: AbstractMachine, rests: bool, inputs: tuple[AbstractMachine, Scalar, State, Any]
+    rests: bool, machine: AbstractMachine, inputs: tuple[Scalar, State, Any]
 ) -> tuple[Scalars, State, tuple[Any, ...]]:
-    numbers, s, start, own = inputs
-    machine = eqx.combine(numbers, rest)
+    s, start, own = inputs
     modes = begin_modes(machine, s, start, own)
     sizes = sizes_of(machine, s, start, modes)
     extents = extents_of(machine, s, start, modes, sizes, rests=rests)
@@ -115,18 +113,22 @@ def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None)
     angles = angles_in(machine, state)
     angles = jnp.zeros(row.shape, bool) if angles is None else angles
     values = unravel(jnp.where(angles, 1.0, jnp.abs(row)))
-    numbers, rest = eqx.partition(machine, eqx.is_array)
-    given = stop_gradient((numbers, state, modes_of(start), values))
-    sizes = lanes.once(partial(_row_sizes, rest), given)
+    given = stop_gradient((state, modes_of(start), values))
+    sizes = lanes.once_with(_constant(machine), _row_sizes, given)
     if rows is not None:
         rows = stop_gradient(jnp.nan_to_num(jnp.abs(rows.reshape(-1, row.size)), posinf=0.0))
         sizes = jnp.maximum(sizes, jnp.max(rows, axis=0))
     return stop_gradient(jnp.where(angles | ~(sizes > _ZERO), 1.0, sizes))
 
 
-def _row_sizes(rest: AbstractMachine, inputs: tuple[AbstractMachine, State, Any, State]) -> Vector:
-    numbers, state, own, values = inputs
-    machine, zero = eqx.combine(numbers, rest), jnp.zeros((), in_rows(values, 0).dtype)
+def _constant(machine: AbstractMachine) -> AbstractMachine:
+    """Return a machine whose numbers have no derivatives."""
+    return jtu.tree_map(lambda x: stop_gradient(x) if eqx.is_array(x) else x, machine)
+
+
+def _row_sizes(machine: AbstractMachine, inputs: tuple[State, Any, State]) -> Vector:
+    state, own, values = inputs
+    zero = jnp.zeros((), in_rows(values, 0).dtype)
     modes = begin_modes(machine, zero, state, own)
     return in_rows(_known_sizes(machine, zero, state, modes, values), 0)
 

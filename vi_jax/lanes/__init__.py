@@ -18,6 +18,7 @@ from .loop import Emitted as Emitted
 from .loop import backend as backend
 from .loop import current_backend as current_backend
 from .loop import once as once
+from .loop import once_with as once_with
 from .loop import run as run
 from .runtime import cores as cores
 from .runtime import processor as processor

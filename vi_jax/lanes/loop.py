@@ -11,6 +11,7 @@ from contextvars import ContextVar
 from types import FunctionType
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -98,6 +99,20 @@ def once(function: Callable[[Any], Any], inputs: object, *, backend: str | None 
     arrays. `vmap` batches it like `run`."""
     end = functools.partial(_end_with, function)
     return run(_begin_ended, _no_step, end, inputs, rows=0, backend=backend)[0]
+
+
+def once_with(
+    module: Any, function: Callable[[Any, Any], Any], inputs: object, *, backend: str | None = None
+) -> Any:
+    """Run `function(module, inputs)` by `once`. Modules that differ in their arrays only share a
+    kernel."""
+    numbers, rest = eqx.partition(module, eqx.is_array)
+    return once(functools.partial(_with_module, rest, function), (numbers, inputs), backend=backend)
+
+
+def _with_module(rest: Any, function: Callable[[Any, Any], Any], given: tuple[Any, Any]) -> Any:
+    numbers, inputs = given
+    return function(eqx.combine(numbers, rest), inputs)
 
 
 def _begin_ended(inputs: object) -> tuple[Any, Emitted]:

@@ -1,10 +1,8 @@
 """The forces of contacts in a given state: of rests, soft stops and dry friction."""
 
-from functools import partial
 from math import pi
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -42,14 +40,12 @@ def contact_forces(machine: Any, state: State, t: Any = 0.0) -> dict[str, Named]
     contacts, such as the fourth leg of a table, are one of many possible choices.
     """
     own, state = modes_of(state), jtu.tree_map(lambda x: 1.0 * jnp.asarray(x), without_modes(state))
-    numbers, rest = eqx.partition(machine, eqx.is_array)
     # By a kernel: XLA compiles the forces of two corners four times as long.
-    return lanes.once(partial(_forces, rest), (numbers, jnp.asarray(t, float), state, own))
+    return lanes.once_with(machine, _forces, (jnp.asarray(t, float), state, own))
 
 
-def _forces(rest: Machine, inputs: tuple[Machine, Scalar, State, Any]) -> dict[str, Named]:
-    numbers, s, state, own = inputs
-    machine: Any = eqx.combine(numbers, rest)
+def _forces(machine: Any, inputs: tuple[Scalar, State, Any]) -> dict[str, Named]:
+    s, state, own = inputs
     modes = begin_modes(machine, s, state, own)
     contact, slips, holds = closed_contacts(machine, s, state, modes)
     found: dict[str, Named] = {}

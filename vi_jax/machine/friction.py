@@ -449,7 +449,7 @@ def pressed_contacts(
     this state open. Of those that are `opened`, the spare ones stay closed; of those that are only
     `touching`, those that are pressed on. Frictions that slip in `modes` go on."""
     indices, switches, solve = frictions_in(machine), switches_of(machine), cast(Any, _settled)
-    slips = tuple(jnp.where(jnp.abs(modes[i]) < 1, 0.0, modes[i]) for i in indices)
+    slips = tuple(slip_in(modes[i]) for i in indices)
     ratios = (switches[i].static_share(machine, s, state) for i in indices)
     holds = tuple(ratio + jnp.zeros_like(s) for ratio in ratios)
     opened = contact if opened is None else opened
@@ -565,6 +565,11 @@ def _question(
         nothing, nothing, nothing,
     )  # fmt: skip
     return question, of
+
+
+def slip_in(mode: Scalar) -> Scalar:
+    """Return the direction in which a friction slips, 0 if it sticks: see `Friction`."""
+    return jnp.where(jnp.abs(mode) < 1, 0.0, mode)
 
 
 def frictions_in(machine: Machine) -> list[int]:

@@ -130,9 +130,8 @@ class Flight(eqx.Module):
         return ravel_pytree(new)[0], elapsed(integrals, after, s1 - s0)
 
     def once(self, function: Callable[["Flight", Any], Any], inputs: object) -> Any:
-        """Compute a function of the flight and one lane's inputs as vector code (`lanes.once`)."""
-        numbers, rest = eqx.partition(self, eqx.is_array)
-        return lanes.once(partial(_call_with_flight, rest, function), (numbers, inputs))
+        """Compute a function of the flight and one lane's inputs as vector code."""
+        return lanes.once_with(self, function, inputs)
 
     def fly(
         self, s0: Scalar, s1: Scalar, u: Vector, steps: int | Scalar,
@@ -167,10 +166,6 @@ def _take_step(
 ) -> tuple[State, Integrals]:  # fmt: skip
     # Six programs of an orbit's equations take such steps: one trace saves a sixth of their time.
     return method.step(smooth, s0, s1, state, before)[:2]
-
-
-def _call_with_flight(rest: Flight, function: Callable[[Flight, Any], Any], inputs: Any) -> Any:
-    return function(eqx.combine(inputs[0], rest), inputs[1])
 
 
 def _begin(averages: tuple[str, ...], inputs: Any) -> tuple[Any, lanes.Emitted]:

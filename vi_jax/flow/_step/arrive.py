@@ -26,6 +26,7 @@ from ...machine import (
     pressed_contacts,
     section_number,
     settled_contacts,
+    slip_in,
     stops_of,
     stops_on,
     struck_modes,
@@ -168,7 +169,7 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
         given = lane._replace(state=new, modes=modes)
         modes, (any_event, kept) = _after_friction(plan, given, released)
         for i, (_, here) in released.items():
-            mode, old_mode = _slips(modes[i]), _slips(modes_before[i])
+            mode, old_mode = slip_in(modes[i]), slip_in(modes_before[i])
             value = jnp.where(here, mode, value)
             # A force that jumps within a step may seem to pass its bound before the jump.
             logged = logged & ~(here & (mode == old_mode))
@@ -213,11 +214,6 @@ def _after_friction(
     old = lane.modes, tuple(map(jnp.abs, contact))
     modes, kept = jax.lax.cond(any_event, settled, lambda: old)
     return modes, (any_event, kept)
-
-
-def _slips(mode: Scalar) -> Scalar:
-    """Return the direction in which a friction slips, 0 if it sticks: see `Friction`."""
-    return jnp.where(jnp.abs(mode) < 1, 0.0, mode)
 
 
 def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, here: Flag) -> Lane:
