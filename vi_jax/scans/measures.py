@@ -415,12 +415,12 @@ class Regime(AbstractMeasure):
     Otherwise it is transiently chaotic: it has settled meanwhile, or is about to. `REGIMES` has the
     numbers for these kinds in `period`.
 
-    The others and these are observed for another `averaged` cycles. They are quasi-periodic if
-    averages over both halves agree to many digits (see `Rotation`), the exponent is zero to the
-    accuracy of that time, and no section is the first one again; chaotic with few digits and a
-    positive exponent; else as before or unsettled, such as a motion with a period above `longest`.
-    Quasi-periodic motions close to a resonance, or with more than two frequencies, and those of
-    machines without losses are mostly called unsettled.
+    The others are observed for another `averaged` cycles. They are quasi-periodic if averages over
+    both halves agree to many digits (see `Rotation`), the exponent is zero to the accuracy of that
+    time, and no section is the first one again; chaotic with few digits and a positive exponent;
+    else unsettled, such as a motion with a period above `longest`. Quasi-periodic motions close to
+    a resonance, or with more than two frequencies, and those of machines without losses are mostly
+    called unsettled.
 
     A chaotic transient looks like chaos while it lasts, so a motion called chaotic may still settle
     later. A longer `lasting` makes this rarer and chaotic lanes costlier; 0 omits the second pass,
@@ -497,11 +497,8 @@ class Regime(AbstractMeasure):
 
     def needs_refinement(self, found, pass_number=0):
         """Return whether it does not repeat; at the second pass, whether it is chaotic."""
-        is_last, period = self._is_last(pass_number), found["period"]
-        is_outer = (jnp.asarray(pass_number) == 0) | is_last
-        wanted = period == jnp.where(is_outer, REGIMES.unsettled, REGIMES.chaotic)
-        # On a torus that attracts slowly the exponent is positive for a while.
-        return wanted | is_last & (period == REGIMES.transient)
+        is_outer = (jnp.asarray(pass_number) == 0) | self._is_last(pass_number)
+        return found["period"] == jnp.where(is_outer, REGIMES.unsettled, REGIMES.chaotic)
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
         """Return whether it is chaotic, at the second pass still chaotic; at the last one whether
@@ -527,7 +524,6 @@ class Regime(AbstractMeasure):
         is_torus = seen.successful & is_neutral & moves_on
         torus = jnp.where(is_torus, REGIMES.quasiperiodic, before)
         is_chaos = seen.successful & (seen.digits < _FEW) & (growth > _GROWS)
-        is_chaos = is_chaos & (before != REGIMES.transient)
         torus = jnp.where(is_chaos, REGIMES.chaotic, torus)
         return {"period": jnp.where(is_last, torus, chaos).astype(before.dtype)}
 
