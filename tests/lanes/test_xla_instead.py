@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from vi_jax import lanes
 from vi_jax._programs import compiled
-from vi_jax.lanes import _code, _primitive, call, runtime
+from vi_jax.lanes import _code, _primitive, call, numpy_call, runtime
 
 from lanes.toys import failing, fall
 
@@ -109,7 +109,8 @@ def test_another_version_of_xlas_call_interface(difference, monkeypatch):
     else:
         monkeypatch.setattr(call, "_Buffers", call._Frame)  # of another size
     monkeypatch.setattr(call, "TARGET", f"vi_jax_lanes_of_another_{difference}")
-    monkeypatch.setattr(_primitive, "register_handler", call.register_handler.__wrapped__)
+    for module in (_primitive, numpy_call):
+        monkeypatch.setattr(module, "register_handler", call.register_handler.__wrapped__)
     _primitive._warn.cache_clear()
     heights = jnp.linspace(1.0, 2.0, 5)
     words = r"version 0\.\d+ of XLA's call interface .* is incompatible"
@@ -118,6 +119,33 @@ def test_another_version_of_xlas_call_interface(difference, monkeypatch):
             found = jax.jit(jax.vmap(lambda x, g: fall(x, g)[0][0], (0, None)))(heights, gravity)
             np.testing.assert_allclose(found, np.sqrt(2 * heights / gravity), rtol=1e-6)
     assert len(seen) == 1
+    assert_calls_numpy()
+
+
+def sums_and_doubles(x, y):
+    return (x + y).sum(axis=-1), 2 * y
+
+
+def assert_calls_numpy():
+    x, y = jnp.arange(6.0).reshape(2, 3), jnp.arange(24.0, dtype=jnp.float32).reshape(4, 3, 2)
+    call = lambda x, y: lanes.call_numpy(sums_and_doubles, [(), (3,)], x, y)
+    within = jax.vmap(call, (None, -1))
+    for function in (jax.vmap(within, (0, 0)), jax.jit(jax.vmap(within, (0, 0)))):
+        total, double = function(x, y[:2])
+        wanted = x[:, None] + y[:2].transpose(0, 2, 1)
+        np.testing.assert_array_equal(total, wanted.sum(axis=-1))
+        np.testing.assert_array_equal(double, 2 * y[:2].transpose(0, 2, 1))
+        assert double.dtype == total.dtype == jnp.float64
+
+
+def test_numpy_functions_in_programs():
+    assert_calls_numpy()
+    with pytest.raises(jax.errors.JaxRuntimeError, match="ValueError: could not be"):
+        jax.block_until_ready(lanes.call_numpy(failing_function, [()], 1.0))
+
+
+def failing_function(x):
+    raise ValueError("could not be done")
 
 
 def test_a_program_on_the_slower_backend_does_not_slow_others():

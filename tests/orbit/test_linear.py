@@ -1,4 +1,4 @@
-"""Linear algebra of small matrices agrees with NumPy's LAPACK; double multipliers."""
+"""Linear algebra of small matrices, the root finder's steps, zeros; double multipliers."""
 
 from types import SimpleNamespace
 
@@ -8,21 +8,46 @@ import numpy as np
 import pytest
 from vi_jax.orbit.conditions import is_defective
 from vi_jax.orbit.linear import solve, svd
+from vi_jax.orbit.locate import bracketed_zero
+from vi_jax.orbit.root_finders import _dogleg
 
 
-@pytest.mark.parametrize("n", [1, 2, 5])
-def test_singular_vectors_of_regular_and_singular_matrices(n):
-    draw, decompose = np.random.default_rng(n), jax.jit(svd)
-    for rank in {n, max(n - 1, 1), 1}:
-        rows = draw.normal(size=(n, rank)) * 10.0 ** draw.uniform(-3, 3, (n, 1))
-        matrix = rows @ draw.normal(size=(rank, n))
-        left, values, right = map(np.asarray, decompose(matrix))
-        exact = np.linalg.svd(matrix)[1]
-        np.testing.assert_allclose(values, exact, atol=1e-14 * exact[0])
-        np.testing.assert_allclose(left * values @ right, matrix, atol=1e-14 * exact[0])
-        for vectors in (left, right):
-            np.testing.assert_allclose(vectors @ vectors.T, np.eye(n), atol=1e-14)
-    assert all(np.isnan(decompose(np.full((n, n), np.nan))[1]))
+def test_singular_values_of_matrices_that_are_not_finite():
+    matrices = np.random.default_rng(0).normal(size=(3, 4, 4)).astype(np.float32)
+    matrices[1, 2, 0] = np.inf
+    left, values, right = svd(matrices)
+    product = (left * values[:, None]) @ right
+    np.testing.assert_allclose(product[[0, 2]], matrices[[0, 2]], atol=1e-5)
+    assert np.isnan(product[1]).all()
+    assert {x.dtype for x in (left, values, right)} == {np.dtype(np.float32)}
+
+
+def test_steps_within_a_trust_region():
+    """A radius of 1 gives the smallest solution. The longer a step, the less remains."""
+    draw = np.random.default_rng(1)
+    jacobians, residuals = draw.normal(size=(64, 3, 3)), draw.normal(size=(64, 3))
+    jacobians[:8, :, 0] = jacobians[:8, :, 1]  # singular
+    step = lambda radius: _dogleg(jacobians, residuals, np.full(64, radius))[0]
+    newton = -np.stack([np.linalg.pinv(J) @ r for J, r in zip(jacobians, residuals, strict=True)])
+    np.testing.assert_allclose(step(1.0), newton, rtol=1e-9, atol=1e-12)
+    lengths = np.linalg.norm(newton, axis=1)
+    np.testing.assert_allclose(np.linalg.norm(step(0.3), axis=1), 0.3 * lengths, rtol=1e-9)
+    left = lambda x: np.linalg.norm(residuals + np.einsum("nij,nj->ni", jacobians, x), axis=1)
+    remain = [left(step(radius)) for radius in (0.0, 1e-3, 0.1, 0.3, 0.9, 1.0)]
+    assert (np.diff(remain, axis=0) <= 1e-12).all()
+
+
+def test_zeros_between_two_places():
+    calls = []
+    for function, zero in (
+        (lambda x: x**3 - 2, 2 ** (1 / 3)), (lambda x: np.exp(40 * x) - 3, np.log(3) / 40),
+        (lambda x: np.sign(x - 0.3), 0.3), (lambda x: x, 0.0),
+    ):  # fmt: skip
+        counted = lambda x, f=function: calls.append(x) or f(x)
+        assert abs(bracketed_zero(counted, 2.0, -1.0, tolerance=1e-14) - zero) < 2e-14
+    assert len(calls) < 100
+    with pytest.raises(ArithmeticError):
+        bracketed_zero(lambda x: x**2 + 1, 0.0, 1.0, tolerance=1e-9)
 
 
 def test_solutions_and_their_derivatives():
@@ -34,6 +59,10 @@ def test_solutions_and_their_derivatives():
             jax.vmap(transform(norm(solver)))(matrices) for solver in (solve, jnp.linalg.solve)
         )
         np.testing.assert_allclose(ours, theirs, rtol=1e-9)
+    matrices[0] = 1.0
+    found = jax.jit(jax.vmap(solve, (0, None)))(matrices, np.eye(3))
+    assert np.isnan(found[0]).all()
+    np.testing.assert_allclose(found[1], np.linalg.inv(matrices[1]), rtol=1e-12)
 
 
 PAIR = [[1.0, 0.0], [0.0, 1.0]]

@@ -20,6 +20,7 @@ from .loop import current_backend as current_backend
 from .loop import once as once
 from .loop import once_with as once_with
 from .loop import run as run
+from .numpy_call import call_numpy as call_numpy
 from .runtime import cores as cores
 from .runtime import processor as processor
 from .runtime import threads as threads

@@ -11,6 +11,8 @@ on XLA's backend, after a warning.
 import ctypes
 import signal
 import threading
+import zlib
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from ctypes import POINTER, Structure, c_char_p, c_int, c_int32, c_int64, c_size_t, c_void_p
 
@@ -187,6 +189,8 @@ def _run_kernel(frame: _Frame) -> int | None:
         ctypes.cast(head.data, POINTER(c_int32)), (2 * (arguments.size + 1),)
     )
     key, lanes, *strides = (int(x) for x in numbers.view(np.int64))
+    if key < 0:
+        return _run_numpy(frame, _numpy_functions[key])
     kernel = kernel_by_key(key)
     if kernel is None:
         return _error(frame, "The kernel of this program is not of this process.", _INTERNAL)
@@ -206,6 +210,33 @@ def _run_kernel(frame: _Frame) -> int | None:
     if work.stop.value:
         return _error(frame, INTERRUPTED, _CANCELLED)
     return _error(frame, "Not all lanes were run.", _INTERNAL)
+
+
+# NumPy's functions that programs call, by negative keys.
+_numpy_functions: dict[int, Callable[..., Sequence[np.ndarray]]] = {}
+
+# Types of numbers in `XLA_FFI_DataType`: F32, F64.
+_TYPES = {11: ctypes.c_float, 12: ctypes.c_double}
+
+
+def numpy_key(function: Callable[..., Sequence[np.ndarray]]) -> int:
+    """Return the key of a NumPy function, the same in all processes, so that JAX's cache may keep
+    the program."""
+    key = -1 - zlib.crc32(f"{function.__module__}.{function.__qualname__}".encode())
+    _numpy_functions[key] = function
+    return key
+
+
+def _run_numpy(frame: _Frame, function: Callable[..., Sequence[np.ndarray]]) -> int:
+    def array(buffer: _Buffer) -> np.ndarray:
+        data = ctypes.cast(buffer.data, POINTER(_TYPES[buffer.dtype]))
+        return np.ctypeslib.as_array(data, buffer.dims[: buffer.rank])
+
+    arguments, results = frame.arguments, frame.results
+    found = function(*(array(arguments.items[i].contents) for i in range(1, arguments.size)))
+    for i, x in enumerate(found):
+        array(results.items[i].contents)[...] = x
+    return SUCCESS
 
 
 def _run_number(frame: _Frame) -> int:

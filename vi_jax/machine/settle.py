@@ -319,7 +319,7 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
     the slip that it begins, until no other begins to slip.
     """
     x, n = stop_gradient(x), x.closed.shape[0]
-    if x.rates.shape == x.level.shape == (1,):
+    if x.rates.shape == (1,):
         return _settle_one(x)
     few_dry = has_ratios and not n and len(x.level) <= _FEW
     found = _decide_dry(x) if few_dry else _decide_in_turn(x, of, has_ratios)
@@ -427,12 +427,15 @@ def _decide_in_turn(x: Contacts, of: tuple[int, ...], has_ratios: bool) -> _Deci
 
 
 def _settle_one(x: Contacts) -> Settled:
-    """Return `settle` of a single dry friction: its problem has a closed form."""
-    needed = -x.rates / x.gains[0]
+    """Return `settle` of a single contact or dry friction: its problem has a closed form."""
+    needed, none = -x.rates / x.gains[0], jnp.zeros((), bool)
+    if not x.level.shape[0]:
+        force = jnp.where(x.closed, jnp.maximum(needed, 0.0), 0.0)
+        kept = x.closed & (needed >= 0)
+        return Settled(force, x.rates + x.gains[0] * force, kept, x.closed & False, x.slip, none)
     slip = jnp.where(jnp.abs(needed) <= x.hold * x.level, 0.0, -jnp.sign(needed))
     mode = jnp.where(x.slip != 0, x.slip, slip)
     force = jnp.where(mode == 0, needed, -mode * x.level)
-    none = jnp.zeros((), bool)
     return Settled(force, x.rates + x.gains[0] * force, x.closed, x.closed, mode, none)
 
 

@@ -22,6 +22,7 @@ from ..machine import components, frequency_ratio, in_unit, quantity_of, units_o
 from .corrector import Step, jacobian_at, on_host
 from .equations import Observed, Shooting
 from .kinds import CROSSING, DOUBLING, FOLD, KINDS, REST, SLIDING, TORUS, TOUCHING, TURNS
+from .linear import solve
 from .rest import Chatter
 from .results import compound
 from .sliding import excess_rates
@@ -197,7 +198,7 @@ class Replacement(eqx.Module):
         jacobian, n = jax.jacfwd(problem.motion_residual)(x), self.left.size
         corner = jnp.zeros((1, 1), x.dtype)
         bordered = jnp.block([[jacobian[:, :n].T, self.right[:, None]], [self.left[None], corner]])
-        left_null = jnp.linalg.solve(bordered, jnp.eye(n + 1, dtype=x.dtype)[-1])[:n]
+        left_null = solve(bordered, jnp.eye(n + 1, dtype=x.dtype)[-1])[:n]
         return residual + self.left * (left_null @ jacobian[:, -1] - self.left @ residual)
 
 

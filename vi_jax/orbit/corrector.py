@@ -28,6 +28,7 @@ from ..machine import (
     with_modes,
 )
 from .equations import Shooting, Unknowns
+from .linear import solve
 from .results import ORBIT_RESULTS, Orbit
 from .tolerances import CORRECTED, LISTED, ROUGHLY
 
@@ -95,7 +96,7 @@ def _advance(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, lengt
         y, before, count, *_ = carry
         jacobian, residual, _ = scaled_jacobian(equations, y)
         right_sides = jnp.stack([residual, jnp.zeros_like(y).at[-1].set(1.0)], axis=-1)
-        move, along = jnp.linalg.solve(jacobian, right_sides).T
+        move, along = solve(jacobian, right_sides).T
         size = jnp.max(jnp.abs(move))
         # One correction more than needed, so that the tangent is that of the solution. On a steep
         # curve rounding may keep all corrections above the tolerance.

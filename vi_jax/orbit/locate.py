@@ -23,6 +23,9 @@ _PLACED = 1e-13
 # equations only the corrector's rounding would be resolved. A choice.
 _TRIALS = 5
 
+# A search for a zero evaluates its function so often at most: a choice.
+_MOST_STEPS = 80
+
 # Distance of samples from a point where branches cross, in scaled unknowns: a choice.
 SPACING = 1e-3
 
@@ -87,15 +90,12 @@ def locate_zero(
         close = len(bracket) == 2 and abs(bracket[True] - bracket[False]) <= resolution
         return 0.0 if close or abs(found) <= _PLACED * max(map(abs, tested.values())) else found
 
-    from scipy.optimize import brentq  # slow to load
-
     # If the test jumps or has no value, use the closest point.
-    options: Any = {"xtol": _PLACED, "rtol": 1e-14, "maxiter": 80}
     try:
         if not value(0.0) * value(length) <= 0:
             return None
         ends = _known_bracket([s for s, step in points.items() if bool(step.good)], length, value)
-        root = float(brentq(value, *ends, full_output=True, disp=False, **options)[0])
+        root = bracketed_zero(value, *ends, tolerance=_PLACED)
         value(root)
     except NoValueError:
         return None
@@ -114,6 +114,36 @@ def locate_zero(
 
     good = [s for s in tested if bool(points[s].good)]
     return points[min(good, key=rank)] if good else None
+
+
+def bracketed_zero(
+    function: Callable[[float], float], low: float, high: float, *, tolerance: float
+) -> float:
+    """Return a zero between two places where a function has different signs, by inverse quadratic
+    interpolation where that is safe, else bisection (T. R. Chandrupatla, Adv. Eng. Softw. 28,
+    1997). SciPy takes half a second to load. **Raises:** `ArithmeticError` for equal signs."""
+    a, b, share = high, low, 0.5
+    at_a, at_b = function(a), function(b)
+    c, at_c = b, at_b
+    if at_a * at_b > 0:
+        raise ArithmeticError("no change of sign")
+    for _ in range(_MOST_STEPS):
+        best = a if abs(at_a) < abs(at_b) else b
+        least = (tolerance + 1e-15 * abs(best)) / abs(b - a) if a != b else 1.0
+        if least > 0.5 or 0.0 in (at_a, at_b):
+            return best
+        place = a + min(max(share, least), 1 - least) * (b - a)
+        value = function(place)
+        if (value > 0) == (at_a > 0):
+            c, at_c = a, at_a
+        else:
+            b, c, at_b, at_c = a, b, at_a, at_b
+        a, at_a, share = place, value, 0.5
+        x, y = (a - b) / (c - b), (at_a - at_b) / (at_c - at_b)
+        if y**2 < x and (1 - y) ** 2 < 1 - x:
+            share = at_a / (at_b - at_a) * at_c / (at_b - at_c)
+            share += (c - a) / (b - a) * at_a / (at_c - at_a) * at_b / (at_c - at_b)
+    return a if abs(at_a) < abs(at_b) else b
 
 
 def _known_bracket(

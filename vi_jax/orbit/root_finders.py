@@ -11,11 +11,13 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from .._checks import count, instance_of, number, require
 from .._types import Scalar
+from ..lanes import call_numpy
 from ..machine import Shown
 from .linear import Matrix, solve, svd
 from .tolerances import LOCATED, ROUNDING
@@ -33,12 +35,16 @@ def rounding(dtype: object) -> float:
 def smallest_solution(matrix: Matrix, right_side: Array) -> Array:
     """Return the smallest solution of `matrix @ step = right_side`; `right_side - matrix @ step` is
     unreachable."""
-    left, sizes, right = svd(stop_gradient(matrix))
-    is_zero = sizes <= rounding(matrix.dtype) * jnp.minimum(sizes[0], _STEEP)
-    size = jnp.where(sizes[0] > 0, sizes[0], 1.0)
-    # Directions without an image get one, so that the matrix can be inverted.
-    filled = (left * (is_zero.astype(matrix.dtype) * size)) @ right
-    return solve(matrix + filled, right_side)
+    (more,) = call_numpy(_missing_images, [matrix.shape], stop_gradient(matrix))
+    return solve(matrix + more, right_side)
+
+
+def _missing_images(matrix: np.ndarray) -> list[np.ndarray]:
+    """Return images of the directions without one, so that the matrix can be inverted."""
+    left, sizes, right = svd(matrix)
+    is_zero = sizes <= rounding(matrix.dtype) * np.minimum(sizes[..., :1], _STEEP)
+    size = np.where(sizes[..., :1] > 0, sizes[..., :1], 1.0)
+    return [(left * (is_zero * size)[..., None, :]) @ right]
 
 
 Unknowns = Float[Array, "..."]
@@ -116,7 +122,8 @@ class Newton(AbstractRootFinder):
         radius = radius * jnp.where(accepted, jnp.where(good, _LONGER, 1.0), _SHORTER)
         x, new = jnp.where(accepted, trial, x), jnp.where(accepted, new, old)
         jacobian = jnp.where(accepted, jacobian, memory.jacobian)
-        move = _dogleg(jacobian, new.ravel(), radius).reshape(x.shape)
+        (move,) = call_numpy(_dogleg, [(x.size,)], jacobian, new.ravel(), radius)
+        move = move.reshape(x.shape)
         memory = _Dogleg(x + move, new, jacobian, radius, jnp.zeros((), bool))
         return x, memory, x, _largest(new)
 
@@ -147,29 +154,31 @@ def _with_jacobian(residual: Residual, x: Unknowns) -> tuple[Unknowns, Matrix]:
     return values[0], columns.reshape(x.size, x.size)
 
 
-def _dogleg(jacobian: Matrix, residual: Array, radius: Scalar) -> Array:
+def _dogleg(jacobian: np.ndarray, residual: np.ndarray, radius: np.ndarray) -> list[np.ndarray]:
     """Return the step on the path from here over the least point along the gradient to Newton's
-    point, at the `radius` over the length of Newton's step (Nocedal and Wright, 4.1)."""
+    point, at the `radius` over the length of Newton's step (Nocedal and Wright, 4.1). Arrays may
+    have batch axes first."""
     left, values, right = svd(jacobian)
+    inner = lambda a, b: np.sum(a * b, axis=-1, keepdims=True)
     # If a direction is neutral, take the smallest of all steps.
-    reachable = values > rounding(jacobian.dtype) * values[0]
-    parts = (residual @ left) / jnp.where(reachable, values, 1.0)
-    newton = -(jnp.where(reachable, parts, 0.0) @ right)
-    gradient = residual @ jacobian
-    curvature, eps = jnp.sum((jacobian @ gradient) ** 2), jnp.finfo(jacobian.dtype).eps
-    curved = curvature > eps
-    cauchy = -gradient * jnp.where(
-        curved, jnp.sum(gradient**2) / jnp.where(curved, curvature, 1.0), 0.0
-    )
-    length, reach = jnp.linalg.norm(cauchy), radius * jnp.linalg.norm(newton)
-    shorter = cauchy * jnp.where(length > eps, reach / jnp.where(length > eps, length, 1.0), 0.0)
+    reachable = values > rounding(jacobian.dtype) * values[..., :1]
+    parts = np.einsum("...i,...ij->...j", residual, left) / np.where(reachable, values, 1.0)
+    newton = -np.einsum("...i,...ij->...j", np.where(reachable, parts, 0.0), right)
+    gradient = np.einsum("...i,...ij->...j", residual, jacobian)
+    image = np.einsum("...ij,...j->...i", jacobian, gradient)
+    curvature, eps = inner(image, image), np.finfo(jacobian.dtype).eps
+    share = np.where(curvature > eps, inner(gradient, gradient) / np.maximum(curvature, eps), 0.0)
+    cauchy, radius = -gradient * share, radius[..., None]
+    length, reach = np.sqrt(inner(cauchy, cauchy)), radius * np.sqrt(inner(newton, newton))
+    shorter = cauchy * np.where(length > eps, reach / np.maximum(length, eps), 0.0)
     # |cauchy + t (newton - cauchy)| = reach, by the stable one of two formulas for the root.
     leg = newton - cauchy
-    a, half_b, c = jnp.sum(leg**2), jnp.sum(cauchy * leg), length**2 - reach**2
-    root = jnp.sqrt(half_b**2 - a * c)
-    t = jnp.where(half_b > 0, -c / (half_b + root), (root - half_b) / a)
-    between = cauchy + jnp.clip(t, 0.0, 1.0) * leg
-    return jnp.where(length > reach, shorter, jnp.where(radius < 1, between, newton))
+    a, half_b, c = inner(leg, leg), inner(cauchy, leg), length**2 - reach**2
+    with np.errstate(all="ignore"):
+        root = np.sqrt(half_b**2 - a * c)
+        t = np.where(half_b > 0, -c / (half_b + root), (root - half_b) / a)
+    between = cauchy + np.clip(t, 0.0, 1.0) * leg
+    return [np.where(length > reach, shorter, np.where(radius < 1, between, newton))]
 
 
 class Gradient(AbstractRootFinder):

@@ -15,6 +15,7 @@ from ..machine import check_leaf, in_unit, leaf, units_of
 from .find import find_orbit
 from .from_orbit import check_parameter, with_parameters
 from .kinds import GRAZING, TORUS
+from .locate import bracketed_zero
 from .results import Orbit
 from .tolerances import LOCATED, ROUGHLY, SAME
 from .torus import MOST, REORDERED, Torus, first_mode, margins_of, torus_of
@@ -274,11 +275,9 @@ class _Walk:
                 raise ArithmeticError
             return margins_of(equations, solved.curve)[number].value
 
-        from scipy.optimize import brentq  # slow to load
-
         try:
-            return solved_at(brentq(margin, 0.0, 1.0, xtol=1e-12))  # pyright: ignore
-        except (ArithmeticError, ValueError):
+            return solved_at(bracketed_zero(margin, 0.0, 1.0, tolerance=1e-12))
+        except ArithmeticError:
             return None
 
     def _stalled(self, longest: float, reason: str) -> _End:

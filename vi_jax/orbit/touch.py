@@ -1,5 +1,6 @@
 """Touches of a stop or a surface by a motion, and the kick that an impact gives there."""
 
+from collections.abc import Callable
 from math import log2
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from ..machine import after_event, events_of, guard_of, jump_of, stops_of
 from .corrector import on_host
 from .equations import Shooting
 from .flight import Event, Flight
+from .locate import bracketed_zero
 from .tolerances import BRIEF, EXACT, LOCATED, ROUNDING
 from .turns import Path, turning_points
 
@@ -141,16 +143,13 @@ def _fly(problem: Shooting, x, number: int, leg, touching: bool, s0, s1, u):
 
 def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
     """Return the change of the state by a contact; `deep` is the free flight's deepest state."""
-    from scipy.optimize import brentq  # slow to load
-
     unit = problem.radian
 
-    def root(function: Any, low: float, high: float) -> float:
+    def root(function: Callable[[float], Any], low: float, high: float) -> float:
         guard = lambda s1: float(function(s1)[1])
         if guard(low) * guard(high) > 0:
             raise NoLocalMapError(_TOO_STIFF)
-        found: Any = brentq(guard, low, high, xtol=1e-15 * unit)
-        return float(found)
+        return bracketed_zero(guard, low, high, tolerance=1e-15 * unit)
 
     def free_flight(s1):
         return _fly(problem, x, number, leg, False, s, s1, deep)
