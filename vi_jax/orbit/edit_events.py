@@ -109,7 +109,7 @@ def repeated(problem: Shooting, x: np.ndarray | Array, new: Shooting) -> np.ndar
     if problem.events:
         clock = (clock + period * np.arange(n)[:, None]).ravel()
         states = np.tile(states, (n, 1))
-    return np.asarray(new.pack(clock, states, x, n * period))
+    return new.pack(clock, states, x, n * period)
 
 
 def locate_origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
@@ -132,7 +132,7 @@ def locate_origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
         states = 0.5 * (first + nearest_images(problem.angles, states[legs:], first))
     else:
         states = states + 0.5 * half_difference(problem, at) * problem.half_scale()
-    mean = np.asarray(half.pack(clock, states, at.x, half_period))
+    mean = half.pack(clock, states, at.x, half_period)
 
     def doubling(step: Step) -> float:
         return float(np.linalg.det(step.observed.monodromy + np.eye(problem.states)))
@@ -171,7 +171,7 @@ def with_sections(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
     new = dataclasses.replace(
         old, events=tuple(events[i] for i in order), modes=tuple(modes[i] for i in order)
     )
-    return new, np.asarray(new.pack(clock[order], np.concatenate([ends, states])[order], x, period))
+    return new, new.pack(clock[order], np.concatenate([ends, states])[order], x, period)
 
 
 def without_events(
@@ -189,7 +189,7 @@ def without_events(
         clock, states = np.zeros(0), state_at(old, x, np.asarray(0), period)[None]
     modes = tuple(old.modes[i] for i in keep) or (old.modes[which[-1]],)
     new = dataclasses.replace(old, events=tuple(old.events[i] for i in keep), modes=modes)
-    return new, np.asarray(new.pack(clock, states, x, period))
+    return new, new.pack(clock, states, x, period)
 
 
 def with_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
@@ -213,4 +213,4 @@ def with_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarra
     new = dataclasses.replace(
         old, cycles=cycles, events=events, modes=old.modes[:legs], steps=steps
     )
-    return new, np.asarray(new.pack(clock[:legs], states[:legs], x, period / repetitions))
+    return new, new.pack(clock[:legs], states[:legs], x, period / repetitions)

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
 from jaxtyping import Array, Complex, Float, Int
@@ -287,7 +288,7 @@ class Shooting(eqx.Module):
         return dataclasses.replace(self, machine=machine, **cleared), x[:end]
 
     def corners(self, intervals: Iterable[tuple[float, float]]) -> list[AbstractMachine]:
-        return [self.at(jnp.asarray(ends)) for ends in itertools.product(*intervals)]
+        return [self.at(np.asarray(ends)) for ends in itertools.product(*intervals)]
 
     def parts(self, x: Unknowns) -> tuple[Float[Array, " legs"], Float[Array, "legs states"]]:
         """Return clock and state at the start of each leg (before its event)."""
@@ -311,21 +312,24 @@ class Shooting(eqx.Module):
 
     def lengths(self, x: Unknowns) -> np.ndarray:
         """Return the duration of each leg by the clock; host-side."""
-        clock, _ = self.parts(x)
-        return np.asarray(self.ends(clock, self.period(x)) - clock)
+        clock, _, period = self.values(x)
+        return np.diff(clock, append=clock[:1] + period)
 
-    def period(self, x: Unknowns) -> Array:
+    def period(self, x: Unknowns) -> Any:
         if self.autonomous:
             return jnp.asarray(x[0])
-        return jnp.asarray(self.at(x).cycle, x.dtype) * self.cycles
+        array = np if isinstance(x, np.ndarray) else jnp
+        return array.asarray(self.at(x).cycle, x.dtype) * self.cycles
 
-    def pack(self, clock: Any, states: Any, x: Any, period: Any = None) -> Vector:
-        """Pack `parts`, the parameters of other unknowns `x` and perhaps a period into unknowns."""
-        clock = jnp.asarray(clock) if self.events else jnp.zeros((0,))
+    def pack(self, clock: Any, states: Any, x: Any, period: Any = None) -> Any:
+        """Pack `parts`, the parameters of other unknowns `x` and perhaps a period into unknowns: a
+        NumPy array if `x` is known."""
+        array = jnp if isinstance(x, Tracer) else np
+        clock = array.asarray(clock) if self.events else np.zeros(0)
         if self.autonomous:
-            clock = (clock - clock[0]).at[0].set(period)
-        parameters = jnp.asarray(x)[len(x) - len(self.parameters) :]
-        return jnp.concatenate([clock, jnp.ravel(states), parameters])
+            clock = array.append(period, clock[1:] - clock[0])
+        parameters = array.asarray(x)[len(x) - len(self.parameters) :]
+        return array.concatenate([clock, array.ravel(states), parameters])
 
     @property
     def scale(self) -> np.ndarray:

@@ -316,7 +316,7 @@ def _follow_events(
     machine = blank.machine
     machine_modes, state = modes_of(state), without_modes(state)
     modes = begin_modes(machine, jnp.zeros(()), state, machine_modes)
-    u, s = ravel_pytree(state)[0], 0.0
+    u, s = np.concatenate([*map(np.ravel, jax.tree.leaves(state))]), 0.0
     states, in_flight = [], []
     # With clocks and steps as arguments, all flights share one program.
     shared = dataclasses.replace(blank, steps=1)
@@ -516,7 +516,7 @@ def resting_problem_of(
     modes = _modes_in_legs(problem, orbit.state, clock, (rows, earlier), begins[-1])
     problem = dataclasses.replace(problem, modes=modes)
     rows = rows if events else np.asarray(raveled(orbit.state)[0])
-    x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)], begins[-1]))
+    x = problem.pack(clock, rows, [leaf(machine, parameter)], begins[-1])
     problem = with_sizes(problem, x)
     error = step_error(problem, x) if steps_depend_on_motion(problem) else 0.0
     if error > 10 * CORRECTED:

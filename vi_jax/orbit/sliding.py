@@ -223,5 +223,5 @@ def _with_part(
         place, extra = clock[first], states[first][None]
     clock = np.insert(clock, first, [place] * len(extra))
     states = np.insert(states, [first] * len(extra), extra, axis=0)
-    x = np.asarray(problem.pack(clock, states, step.x, period))
+    x = problem.pack(clock, states, step.x, period)
     return at._replace(x=x, observed=observe(problem, x))

@@ -230,7 +230,7 @@ def _with_touch(
         clock, states = np.mod(clock, period)[order], states[order]
         events = [[*events, hit][i] for i in order]
     new = dataclasses.replace(old, events=tuple(events), modes=((),) * len(events))
-    return new, np.asarray(new.pack(clock, states, x, period))
+    return new, new.pack(clock, states, x, period)
 
 
 def _as_kind(kind: str, point: Point, distance: float) -> Point:
