@@ -17,7 +17,7 @@ FILES = sorted(HOUSE.rglob("*.py"))
 # Each package may import from those before it.
 ORDER = "lanes machine machines flow orbit scans robust plot explore cli".split()
 LATE = [["explore", "serve"], ["explore", "subject"]]
-TOOLS = {"_checks", "_collection", "_messages", "_programs", "_types"}
+TOOLS = {"_checks", "_loading", "_messages", "_programs", "_types"}
 
 
 def imports(path: Path) -> Iterator[tuple[list[str], str]]:

@@ -81,7 +81,7 @@ from .orbit import cycle_map as cycle_map
 from .orbit import distinct_orbits as distinct_orbits
 from .orbit import find_orbit as find_orbit
 from .orbit import find_torus as find_torus
-from .orbit import grazing as grazing
+from .orbit.grazing import grazing as grazing
 from .plot import animate as animate
 from .plot import plot_basins as plot_basins
 from .plot import plot_boundary as plot_boundary

@@ -22,7 +22,7 @@ import numpy as np
 from jax.core import Tracer
 
 from ._checks import unwritable
-from ._collection import without_collection
+from ._loading import without_collection
 from .lanes import (
     Unsupported,
     current_backend,

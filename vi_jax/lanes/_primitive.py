@@ -17,7 +17,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir, partial_eval
 
-from .._collection import without_collection
+from .._loading import without_collection
 from ._arrays import MOST_IN_REGISTERS
 from ._derivative import forward, widened
 from ._program import LaneProgram, batch_of, dependent_parts, shape_of

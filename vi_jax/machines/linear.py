@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from .._checks import concrete, number
@@ -255,7 +254,8 @@ def _modal_basis(mass: Any, damping: Any, stiffness: Any) -> _Basis:
     M, C, K = (jnp.diag(x) if x.ndim == 1 else x for x in (mass, damping, stiffness))
     n, eps = M.shape[0], jnp.finfo(M.dtype).eps
     L = jnp.linalg.cholesky(M)
-    inverse = solve_triangular(L, jnp.eye(n, dtype=M.dtype), lower=True)
+    identity = jnp.eye(n, dtype=M.dtype)
+    inverse = jax.lax.linalg.triangular_solve(L, identity, left_side=True, lower=True)
     K_modal, C_modal = inverse @ K @ inverse.T, inverse @ C @ inverse.T
     U = stop_gradient(jnp.linalg.eigh(stop_gradient(0.5 * (K_modal + K_modal.T)))[1])
     K_modal, C_modal = U.T @ K_modal @ U, U.T @ C_modal @ U

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import count, flag
@@ -102,8 +101,9 @@ def shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Arra
     """Return ∂F/∂x. Its diagonal holds the derivatives of each arc's end with respect to its start;
     next to it are entries -1 for the next arc's start."""
     arcs, states, _ = jacobians.shape
-    following = jnp.kron(jnp.roll(jnp.eye(arcs), 1, axis=1), jnp.eye(states))
-    return block_diag(*jacobians) - following.astype(jacobians.dtype)
+    following = np.kron(np.roll(np.eye(arcs), 1, axis=1), np.eye(states))
+    blocks = jnp.einsum("ab,aij->aibj", np.eye(arcs, dtype=jacobians.dtype), jacobians)
+    return blocks.reshape(following.shape) - following.astype(jacobians.dtype)
 
 
 def _start_change(

@@ -126,6 +126,8 @@ class Point:
 
         **Raises:** `ValueError` for other kinds, or if there is no admissible motion beyond.
         """
+        from . import switch  # noqa: F401  # it registers what begins at special points
+
         distance = given_number("distance", distance, low=0.0, open_low=True)
         here = starts.get((self.curve, self.kind), {})
         if not here:
