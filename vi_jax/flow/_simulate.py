@@ -219,7 +219,9 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     records = jtu.tree_map(lambda x: x[1:], records)
 
     def per_cycle(values, reduce):
-        return None if values is None else reduce(values.reshape(plan.cycles, parts), axis=1)
+        if values is None or parts == 1:
+            return values
+        return reduce(values.reshape(plan.cycles, parts), axis=1)
 
     integrals = dict(records.integrals)
     times = integrals.pop(TIME, None)
@@ -232,7 +234,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     period = jnp.broadcast_to(cycle_time(machine), (plan.cycles,)).astype(lane.steps.dtype)
     duration = None
     if plan.records_motion:
-        reached = jnp.isfinite(records.impacts).reshape(plan.cycles, parts).all(axis=1)
+        reached = per_cycle(jnp.isfinite(records.impacts), jnp.all)
         fixed = jnp.where(reached, period, jnp.nan)
         duration = fixed if times is None else per_cycle(times, jnp.sum)
     averages = {}
