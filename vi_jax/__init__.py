@@ -10,7 +10,9 @@ __all__, _load = on_first_access(__name__, __file__)  # pyright: ignore
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return _load("_messages").installed_version()
+        from ._messages import installed_version
+
+        return installed_version()
     return globals().setdefault(name, _load(name))
 
 
