@@ -158,12 +158,8 @@ def _dogleg(jacobian: np.ndarray, residual: np.ndarray, radius: np.ndarray) -> l
     """Return the step on the path from here over the least point along the gradient to Newton's
     point, at the `radius` over the length of Newton's step (Nocedal and Wright, 4.1). Arrays may
     have batch axes first."""
-    left, values, right = svd(jacobian)
     inner = lambda a, b: np.sum(a * b, axis=-1, keepdims=True)
-    # If a direction is neutral, take the smallest of all steps.
-    reachable = values > rounding(jacobian.dtype) * values[..., :1]
-    parts = np.einsum("...i,...ij->...j", residual, left) / np.where(reachable, values, 1.0)
-    newton = -np.einsum("...i,...ij->...j", np.where(reachable, parts, 0.0), right)
+    newton = _newton_step(jacobian, residual)
     gradient = np.einsum("...i,...ij->...j", residual, jacobian)
     image = np.einsum("...ij,...j->...i", jacobian, gradient)
     curvature, eps = inner(image, image), np.finfo(jacobian.dtype).eps
@@ -179,6 +175,24 @@ def _dogleg(jacobian: np.ndarray, residual: np.ndarray, radius: np.ndarray) -> l
         t = np.where(half_b > 0, -c / (half_b + root), (root - half_b) / a)
     between = cauchy + np.clip(t, 0.0, 1.0) * leg
     return [np.where(length > reach, shorter, np.where(radius < 1, between, newton))]
+
+
+def _newton_step(jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Return Newton's step; if a direction is neutral, the smallest of all steps."""
+    try:  # the inverse takes a tenth of the time of singular values
+        inverse = np.linalg.inv(jacobian)
+    except np.linalg.LinAlgError:
+        inverse = np.full_like(jacobian, np.nan)
+    step = -np.einsum("...ij,...j->...i", inverse, residual)
+    condition = np.linalg.norm(jacobian, axis=(-2, -1)) * np.linalg.norm(inverse, axis=(-2, -1))
+    doubtful = ~(condition < 0.1 / rounding(jacobian.dtype))
+    if doubtful.any():
+        left, values, right = svd(jacobian[doubtful])
+        reachable = values > rounding(jacobian.dtype) * values[:, :1]
+        parts = np.einsum("ni,nij->nj", residual[doubtful], left)
+        parts = np.where(reachable, parts / np.where(reachable, values, 1.0), 0.0)
+        step[doubtful] = -np.einsum("ni,nij->nj", parts, right)
+    return step
 
 
 class Gradient(AbstractRootFinder):
