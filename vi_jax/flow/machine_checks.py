@@ -28,6 +28,7 @@ from ..machine import (
     RigidStop,
     SoftStop,
     begin_modes,
+    call_law,
     check_takes,
     clock_of,
     component,
@@ -332,13 +333,23 @@ def _check_frictions(machine: AbstractMachine, s: Scalar, state: State) -> None:
     if is_builtin(type(machine)) or not frictions:
         return
     for friction in frictions:
-        slip = "on" if friction.slip is None else "slip"
-        checks = {slip: friction.speed_of_slip, "level` or `load": friction.sticking}
+        laws = {"slip": friction.slip, "load": friction.load}
+        checks: dict[str, Any] = {
+            x: functools.partial(call_law, f) for x, f in laws.items() if f is not None
+        }
+        if friction.slip is None:
+            checks["on"] = friction.speed_of_slip
+        if callable(friction.level):
+            checks["level"] = lambda *here, f=friction: f.level(f.speed_of_slip(*here))
         for part, function in checks.items():
             label = f"`{part}` of a DryFriction of a {type(machine).__name__}"
+
+            def law(x, f=function, label=label):
+                return jnp.asarray(returned(f(machine, s, x), label, "a number"))
+
             try:
                 with explain_errors(label):
-                    jax.eval_shape(lambda x, f=function: jnp.asarray(f(machine, s, x)), state)
+                    jax.eval_shape(law, state)
             except (AttributeError, LookupError, TypeError, ValueError) as error:
                 if str(error).startswith(label):
                     raise
@@ -579,21 +590,28 @@ _KINDS = {
 }
 
 
+def _member(machine: AbstractMachine, name: str, what: str) -> Any:
+    """Return an attribute. **Raises:** `TypeError` if it is a property that returns `None`."""
+    label = f"`{name}` of a {type(machine).__name__}"
+    with explain_errors(label):
+        found = getattr(machine, name)
+    is_property = isinstance(getattr(type(machine), name, None), property)
+    return returned(found, label, what) if is_property else found
+
+
 def check_parts(machine: AbstractMachine) -> None:
     """Check the parts of a machine before anything is traced. **Raises:** `TypeError` or
     `ValueError` for an invalid one."""
     name = type(machine).__name__
     for what, (belongs, words) in _KINDS.items():
-        with explain_errors(f"`{what}` of a {name}"):
-            parts = listed(getattr(machine, what))
+        parts = listed(_member(machine, what, "a tuple"))
         if not isinstance(parts, tuple) or not all(map(belongs, parts)):
             hint = " Write `@property` above its `def`." if callable(parts) else ""
             raise TypeError(
                 f"`{what}` of a {name} must be a tuple of {words}: got {parts!r}.{hint}"
             )
     _check_names(machine)
-    with explain_errors(f"`cycle` of a {name}"):
-        length = machine.cycle
+    length = _member(machine, "cycle", "a number")
     if callable(length) or isinstance(length, str | bool | None):
         got = "a function" if callable(length) else repr(length)
         raise TypeError(
