@@ -67,6 +67,18 @@ def test_sticking_begins_on_den_hartogs_curve():
         assert friction == pytest.approx(den_hartog(omega, 0.0)[1], abs=1e-8)
 
 
+def test_a_motion_that_ceases():
+    """Friction of the size of the drive, 1, holds the body throughout, anywhere: both slips vanish
+    at once, and the motion without them has a multiplier 1."""
+    branch = branch_of("level", (0.7, 1.2), omega=0.3, level=0.8, damping=0.1)
+    assert branch.ends == ("bounds", "adding-sliding")
+    (point,) = branch.special
+    assert point.kind == "adding-sliding" and "held there throughout" in point.detail
+    assert point.parameter == pytest.approx(1, abs=1e-7)
+    with pytest.raises(ValueError, match="Several of its events vanish at once"):
+        vi.boundary(point, parameter="omega", bounds=((0.7, 1.2), (0.2, 0.4)))
+
+
 def excess_force(omega, numbers, near):
     """Return the excess of the force over the friction level, where the body stops near a phase."""
     events = settled(omega, numbers["level"], numbers["second"], numbers["damping"])
