@@ -28,7 +28,6 @@ from ..machine import (
     RigidStop,
     SoftStop,
     begin_modes,
-    call_law,
     check_takes,
     clock_of,
     component,
@@ -333,23 +332,14 @@ def _check_frictions(machine: AbstractMachine, s: Scalar, state: State) -> None:
     if is_builtin(type(machine)) or not frictions:
         return
     for friction in frictions:
-        laws = {"slip": friction.slip, "load": friction.load}
-        checks: dict[str, Any] = {
-            x: functools.partial(call_law, f) for x, f in laws.items() if f is not None
-        }
-        if friction.slip is None:
-            checks["on"] = friction.speed_of_slip
-        if callable(friction.level):
-            checks["level"] = lambda *here, f=friction: f.level(f.speed_of_slip(*here))
-        for part, function in checks.items():
+        for part, law in friction.laws().items():
             label = f"`{part}` of a DryFriction of a {type(machine).__name__}"
-
-            def law(x, f=function, label=label):
-                return jnp.asarray(returned(f(machine, s, x), label, "a number"))
-
+            number = lambda x, f=law, y=label: jnp.asarray(
+                returned(f(machine, s, x), y, "a number")
+            )
             try:
                 with explain_errors(label):
-                    jax.eval_shape(law, state)
+                    jax.eval_shape(number, state)
             except (AttributeError, LookupError, TypeError, ValueError) as error:
                 if str(error).startswith(label):
                     raise

@@ -249,6 +249,18 @@ class DryFriction(Friction):
             return jnp.asarray(call_law(self.slip, machine, s, state))
         return machine._coordinate_on(self.on, self.mass).velocity(state)
 
+    def laws(self) -> dict[str, Any]:
+        """Return what the user gives as functions of machine, time and state, by argument."""
+        given = {"slip": self.slip, "load": self.load}
+        found: dict[str, Any] = {
+            name: functools.partial(call_law, f) for name, f in given.items() if f is not None
+        }
+        if self.slip is None:
+            found["on"] = self.speed_of_slip
+        if callable(self.level):
+            found["level"] = lambda *here: self.level(self.speed_of_slip(*here))
+        return found
+
     def row(self, machine: Machine, s: Scalar, state: State) -> Row:
         """Return the slip's row in the equations of contacts."""
         if self.push is None:
