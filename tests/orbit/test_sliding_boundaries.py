@@ -67,6 +67,19 @@ def test_sticking_begins_on_den_hartogs_curve():
         assert friction == pytest.approx(den_hartog(omega, 0.0)[1], abs=1e-8)
 
 
+def test_a_curve_ends_where_another_segment_vanishes():
+    """Regression: a curve of grazing-sliding went on with a segment of negative length. It ends at
+    the crossing-sliding of the branch with that damping."""
+    numbers, bounds = dict(omega=0.3, second=0.05), (0.05, 0.25)
+    point = branch_of("level", bounds, level=0.15, damping=0.1, **numbers).special[-1]
+    curve = vi.boundary(point, parameter="damping", bounds=(bounds, (0.05, 0.15)), progress=False)
+    assert curve.kind == "grazing-sliding" and curve.ends == ("crossing-sliding", "bounds")
+    level, damping = curve.parameters[0]
+    branch = branch_of("level", (0.05, 0.16), level=0.15, damping=damping, **numbers)
+    assert branch.special[0].kind == "crossing-sliding"
+    assert branch.special[0].parameter == pytest.approx(level, abs=1e-8)
+
+
 def test_a_motion_that_ceases():
     """Friction of the size of the drive, 1, holds the body throughout, anywhere: both slips vanish
     at once, and the motion without them has a multiplier 1."""

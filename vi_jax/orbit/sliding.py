@@ -70,7 +70,7 @@ def change_at(problem: Shooting, at: Step) -> Change | None:
     found = (
         vanishing_part(problem, at, FAINT)
         or _touching_part(problem, at)
-        or _change_at_event(problem, at)
+        or change_at_event(problem, at)
         or vanishing_part(problem, at, NEARBY)  # a corrector may not get closer
     )
     return found if found is not None and found.kind is not None else None
@@ -110,7 +110,7 @@ def _touching_part(problem: Shooting, at: Step) -> Change | None:
     return Change(number, place, (mode, 0.0, mode), False) if excess < LOCATED else None
 
 
-def _change_at_event(problem: Shooting, at: Step) -> Change | None:
+def change_at_event(problem: Shooting, at: Step) -> Change | None:
     """Return an event of a switch at the limit of being held there."""
     clock, found = problem.values(at.x)[0], []
     for i, event in enumerate(problem.events):
