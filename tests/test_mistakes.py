@@ -439,14 +439,40 @@ class Spare(Machine):
 
 @pytest.mark.parametrize(
     ("base", "member"),
-    [(Machine, x) for x in ("field", "start", "step_limit", "averages", "quantities")]
+    [(Machine, x) for x in ("cycle", "contacts", "events", "modes")]
+    + [(Machine, x) for x in ("field", "start", "step_limit", "averages", "quantities")]
     + [(Masses, x) for x in ("force", "mass", "prescribed", "start")],
 )
 def test_a_method_without_its_return(base, member):
-    kind = type("Forgetful", (base,), {member: lambda self, *args: None})
+    method = lambda self, *args: None
+    of_property = member in ("cycle", "contacts", "events")
+    kind = type("Forgetful", (base,), {member: property(method) if of_property else method})
     with warnings.catch_warnings(action="error"):
         said = refused(lambda: vi.simulate(kind(), cycles=1))
     assert said.startswith(f"`{member}` of a Forgetful must return ")
+    assert said.endswith(", but its `return` is missing.")
+
+
+def nothing(*args):
+    return None
+
+
+@pytest.mark.parametrize(
+    ("member", "part", "whose"),
+    [
+        ("contacts", vi.DryFriction(nothing, on="V"), "`level` of a DryFriction"),
+        ("contacts", vi.DryFriction(0.1, on="V", load=nothing), "`load` of a DryFriction"),
+        ("contacts", vi.RigidStop(1.0, nothing), "The restitution law of stop 0"),
+        ("cycle", vi.rising(nothing, usual=6.3), "The function in `cycle`"),
+        ("cycle", vi.rising("V", usual=nothing), "`usual` in the `cycle`"),
+        ("events", vi.Switch(nothing), "The function of a Switch"),
+        ("events", vi.Reset(lambda m, s, x: x.Y, when=nothing), "`when` of a Reset"),
+    ],
+)
+def test_a_part_without_its_return(member, part, whose):
+    kind = type("Forgetful", (Machine,), {member: part})
+    said = refused(lambda: vi.simulate(kind(), cycles=1))
+    assert said.startswith(f"{whose} of a Forgetful must ")
     assert said.endswith(", but its `return` is missing.")
 
 
@@ -496,7 +522,7 @@ def test_a_method_without_its_return(base, member):
         (lambda: simulate(WithoutMode()), "must take `t`, `q`, `v` and 1 mode "),
         (lambda: vi.SoftStop(0.1, 9.0, restitution=0.5, dashpot=1.0), "`dashpot` must be left out"),
         (lambda: vi.simulate(RubsPosition(), cycles=1), "its rate is 'u'. Write `on='u'`"),
-        (lambda: vi.simulate(RubbedByIf(), cycles=1), "`level` or `load` of a DryFriction of a"),
+        (lambda: vi.simulate(RubbedByIf(), cycles=1), "`level` of a DryFriction of a"),
         (lambda: vi.simulate(RubbedByNobody(), cycles=1), "`slip` of a DryFriction of a Rubbed"),
         (lambda: simulate(OnNothing()), "OnNothing must be given: `on='x'`, or another of"),
         (lambda: simulate(RowOfForces()), "its rate of v.x has shape (1,), not ()"),

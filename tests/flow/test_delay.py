@@ -2,6 +2,7 @@
 
 import importlib
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -363,3 +364,19 @@ def test_refusals_name_what_is_wrong():
         vi.simulate(WithoutPast())
     with pytest.raises(TypeError, match=r"needs the chain as its machine, .* `orbit.machine`"):
         vi.simulate(Struck(), vi.delay_chain(Struck()).start())
+    with pytest.raises(TypeError, match="`field` of a Struck must be computable, but: The state"):
+        vi.simulate(Struck(), vi.State(x=0.0))
+
+
+def test_a_state_of_a_chain_has_its_history():
+    chain, other = (vi.delay_chain(Struck(), nodes) for nodes in (4, 8))
+    for call in (
+        lambda: vi.simulate(chain, vi.State(x=0.0, u=0.0)),
+        lambda: vi.simulate(chain, other.start()),
+        lambda: vi.find_orbit(chain, vi.State(x=0.0, u=0.0)),
+        lambda: vi.find_orbit(chain, vi.HybridState(vi.State(x=0.0, u=0.0), (), None)),
+    ):
+        with pytest.raises(TypeError, match=r"of shape \(4, 1\), but has .* Pass `machine.chained"):
+            call()
+    run = vi.simulate(chain)
+    assert re.search(r"last section: x = \S+, u = \S+, history = \S+ … \S+ \(4 × 1\)\n", str(run))

@@ -1,12 +1,14 @@
 """Contents of a run, and representations as text."""
 
 import pickle
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.flow._simulate import _by_cycle
 from vi_jax.machine import by_name, unit_of
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
@@ -29,6 +31,15 @@ def test_samples_refine_the_sections(method):
     np.testing.assert_allclose(
         np.where(np.isnan(speeds), 0.0, speeds).max(axis=1), plain.impact_speed, atol=1e-12
     )
+
+
+def test_a_log_in_intervals_has_the_first_entries_of_each_cycle():
+    """With room for three entries, in cycles of four intervals."""
+    log = np.full((8, 2, 3), np.nan)
+    for interval, entries in {0: [1.0], 2: [2.0, 3.0, 4.0], 3: [5.0], 7: [6.0, 7.0]}.items():
+        log[interval, :, : len(entries)] = entries
+    (found, _) = _by_cycle(SimpleNamespace(cycles=2, parts=4), jnp.asarray(log), used=1)
+    np.testing.assert_array_equal(found, [[1.0, 2.0, 3.0], [6.0, 7.0, np.nan]])
 
 
 def test_sections_only():

@@ -1,5 +1,6 @@
 """Dry friction with sticking, compared with Den Hartog and closed forms."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -301,6 +302,37 @@ def test_friction_without_load_logs_only_changes():
     assert log.number[0, :3].tolist() == [1, 0, -1]
     assert log.value[0, :2].tolist() == [-1, 0]  # the second slips, the first sticks
     np.testing.assert_allclose([run.last.c, run.last.d], [1.75, 0.0], rtol=0, atol=1e-8)
+
+
+class Loaded(vi.AbstractMachine):
+    """A body that is pulled and rubs: x'' = pull(x) - level(x') load(x)."""
+
+    pull: Callable = eqx.field(static=True)
+    load: Callable | None = eqx.field(static=True, default=None)
+    level: Any = 1.0
+    cycle = 3.0
+
+    @property
+    def contacts(self):
+        return vi.DryFriction(self.level, on="u", load=self.load)
+
+    def field(self, t, z):
+        return dict(x=z.u, u=self.pull(z.x))
+
+
+def test_a_load_that_becomes_negative_ends_the_lane():
+    """A load of 1 - x, or a level that falls with the speed. One that only touches zero ends
+    nothing: x'' = x²/2 from x = -1 with the speed √⅓ has x' = √((x³ + 2)/3)."""
+    pull, start = lambda x: 1.2, vi.State(x=0.0, u=0.5)
+    falling = Loaded(pull, lambda z: 1 - z.x), Loaded(pull, None, lambda v: 1 - v / 2)
+    for machine in falling:
+        assert vi.simulate(machine, start).result == vi.RESULTS.jammed
+    lifted = Loaded(pull, lambda z: jnp.maximum(1 - z.x, 0))
+    assert vi.simulate(lifted, start).successful
+    touching = Loaded(lambda x: x**2, lambda z: z.x**2, 0.5)
+    end = vi.simulate(touching, vi.State(x=-1.0, u=3**-0.5)).last
+    np.testing.assert_allclose(end.u, jnp.sqrt((end.x**3 + 2) / 3), rtol=1e-9)
+    assert end.x > 0
 
 
 class Pressed(vi.AbstractMachine):

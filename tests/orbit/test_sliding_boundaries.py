@@ -67,6 +67,31 @@ def test_sticking_begins_on_den_hartogs_curve():
         assert friction == pytest.approx(den_hartog(omega, 0.0)[1], abs=1e-8)
 
 
+def test_a_curve_ends_where_another_segment_vanishes():
+    """Regression: a curve of grazing-sliding went on with a segment of negative length. It ends at
+    the crossing-sliding of the branch with that damping."""
+    numbers, bounds = dict(omega=0.3, second=0.05), (0.05, 0.25)
+    point = branch_of("level", bounds, level=0.15, damping=0.1, **numbers).special[-1]
+    curve = vi.boundary(point, parameter="damping", bounds=(bounds, (0.05, 0.15)), progress=False)
+    assert curve.kind == "grazing-sliding" and curve.ends == ("crossing-sliding", "bounds")
+    level, damping = curve.parameters[0]
+    branch = branch_of("level", (0.05, 0.16), level=0.15, damping=damping, **numbers)
+    assert branch.special[0].kind == "crossing-sliding"
+    assert branch.special[0].parameter == pytest.approx(level, abs=1e-8)
+
+
+def test_a_motion_that_ceases():
+    """Friction of the size of the drive, 1, holds the body throughout, anywhere: both slips vanish
+    at once, and the motion without them has a multiplier 1."""
+    branch = branch_of("level", (0.7, 1.2), omega=0.3, level=0.8, damping=0.1)
+    assert branch.ends == ("bounds", "adding-sliding")
+    (point,) = branch.special
+    assert point.kind == "adding-sliding" and "held there throughout" in point.detail
+    assert point.parameter == pytest.approx(1, abs=1e-7)
+    with pytest.raises(ValueError, match="Several of its events vanish at once"):
+        vi.boundary(point, parameter="omega", bounds=((0.7, 1.2), (0.2, 0.4)))
+
+
 def excess_force(omega, numbers, near):
     """Return the excess of the force over the friction level, where the body stops near a phase."""
     events = settled(omega, numbers["level"], numbers["second"], numbers["damping"])

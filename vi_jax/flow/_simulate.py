@@ -349,12 +349,21 @@ def _event_log(plan: Plan, entries: Any) -> EventLog:
 
 def _by_cycle(plan: Plan, entries: Array, *, used: int) -> list[Array]:
     """Return the rows of a log (intervals, rows, size), each as (cycles, size): the first entries
-    of each cycle in their order. Row `used` is NaN in unused places, which come last."""
+    of each cycle in their order. Row `used` is NaN in unused places, the last of an interval."""
     rows, size = entries.shape[1:]
+    if plan.parts == 1:
+        return list(jnp.moveaxis(entries, 1, 0))
     entries = entries.reshape(plan.cycles, plan.parts, rows, size)
-    entries = jnp.moveaxis(entries, 2, 0).reshape(rows, plan.cycles, plan.parts * size)
-    order = jnp.argsort(jnp.isnan(entries[used]), axis=1, stable=True)[:, :size]
-    return [jnp.take_along_axis(x, order, axis=1) for x in entries]
+    counts = jnp.sum(~jnp.isnan(entries[:, :, used]), axis=2)
+    begins = jnp.cumsum(jnp.pad(counts, ((0, 0), (1, 0))), axis=1)
+
+    def first_entries(entries: Array, begins: Array) -> Array:
+        # A sort of all places took four fifths of a scan with 2,048 intervals.
+        place = jnp.arange(size)
+        part = jnp.searchsorted(begins[1:], place, side="right")
+        return entries.at[part, :, place - begins[part]].get(mode="fill", fill_value=jnp.nan)
+
+    return list(jnp.moveaxis(jax.vmap(first_entries)(entries, begins), 2, 0))
 
 
 def _as_integers(x: Array) -> Array:

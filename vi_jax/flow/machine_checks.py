@@ -332,13 +332,14 @@ def _check_frictions(machine: AbstractMachine, s: Scalar, state: State) -> None:
     if is_builtin(type(machine)) or not frictions:
         return
     for friction in frictions:
-        slip = "on" if friction.slip is None else "slip"
-        checks = {slip: friction.speed_of_slip, "level` or `load": friction.sticking}
-        for part, function in checks.items():
+        for part, law in friction.laws().items():
             label = f"`{part}` of a DryFriction of a {type(machine).__name__}"
+            number = lambda x, f=law, y=label: jnp.asarray(
+                returned(f(machine, s, x), y, "a number")
+            )
             try:
                 with explain_errors(label):
-                    jax.eval_shape(lambda x, f=function: jnp.asarray(f(machine, s, x)), state)
+                    jax.eval_shape(number, state)
             except (AttributeError, LookupError, TypeError, ValueError) as error:
                 if str(error).startswith(label):
                     raise
@@ -579,21 +580,28 @@ _KINDS = {
 }
 
 
+def _member(machine: AbstractMachine, name: str, what: str) -> Any:
+    """Return an attribute. **Raises:** `TypeError` if it is a property that returns `None`."""
+    label = f"`{name}` of a {type(machine).__name__}"
+    with explain_errors(label):
+        found = getattr(machine, name)
+    is_property = isinstance(getattr(type(machine), name, None), property)
+    return returned(found, label, what) if is_property else found
+
+
 def check_parts(machine: AbstractMachine) -> None:
     """Check the parts of a machine before anything is traced. **Raises:** `TypeError` or
     `ValueError` for an invalid one."""
     name = type(machine).__name__
     for what, (belongs, words) in _KINDS.items():
-        with explain_errors(f"`{what}` of a {name}"):
-            parts = listed(getattr(machine, what))
+        parts = listed(_member(machine, what, "a tuple"))
         if not isinstance(parts, tuple) or not all(map(belongs, parts)):
             hint = " Write `@property` above its `def`." if callable(parts) else ""
             raise TypeError(
                 f"`{what}` of a {name} must be a tuple of {words}: got {parts!r}.{hint}"
             )
     _check_names(machine)
-    with explain_errors(f"`cycle` of a {name}"):
-        length = machine.cycle
+    length = _member(machine, "cycle", "a number")
     if callable(length) or isinstance(length, str | bool | None):
         got = "a function" if callable(length) else repr(length)
         raise TypeError(

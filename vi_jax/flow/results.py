@@ -355,7 +355,8 @@ class RESULTS(NamedEnumeration):
     )
     jammed = (
         "No motion with a closed contact or a sticking body fulfils Coulomb's law of friction, as "
-        "for a rod that is pushed into rough ground (Painlevé's paradox)."
+        "for a rod that is pushed into rough ground (Painlevé's paradox), or the `level` or `load` "
+        "of a `DryFriction` became negative. Write `jnp.maximum(..., 0)` for a body that lifts off."
     )
     full_history = (
         "The steps within the longest delay are more than the history holds. Write a larger "

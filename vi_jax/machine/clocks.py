@@ -13,6 +13,7 @@ from .._checks import in_range
 from .._messages import count_of
 from .._types import Flag, Machine, Number, Scalar, State
 from .cycles import counts_turns
+from .delay_chain import check_history
 from .parts import clock_of, stops_of, switches_of
 
 
@@ -56,12 +57,15 @@ def phase_at(machine: Machine, since_section: Number) -> Any:
 @singledispatch
 def convert_start(machine: Machine, start: State) -> State:
     """Return a start in the form that a machine needs. **Raises:** `TypeError` for others."""
+    check_history("start", machine, start)
     return start
 
 
 @singledispatch
 def in_cycle_state(machine: Machine, name: str, state: State) -> State:
-    """Return a section state of any clock in the form for `in_cycle_clock`."""
+    """Return a section state of any clock in the form for `in_cycle_clock`. **Raises:** `TypeError`
+    for others."""
+    check_history(name, machine, state)
     return state
 
 

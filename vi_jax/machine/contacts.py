@@ -18,6 +18,7 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array
 
+from .._checks import returned
 from .._messages import count_of
 from .._types import Flag, Machine, Scalar, Scalars, State
 from .coordinates import Row
@@ -323,9 +324,9 @@ def check_takes(
 
 def call_checked(function: Callable[..., Any], whose: str, *arguments: Any) -> Any:
     """Return the result of a function of a machine's event. **Raises:** `TypeError` with the
-    function's name `whose`, if it takes other arguments."""
+    function's name `whose`, if it takes other arguments or returns `None`."""
     try:
-        return function(*arguments)
+        return returned(function(*arguments), whose, "a value")
     except TypeError:
         check_takes(function, whose, "the machine, `t`, the state", arguments, len(arguments) - 3)
         raise

@@ -35,7 +35,10 @@ class Counter(abc.ABC):
     def length(self, machine: Any) -> Any:
         """Return the usual length of a cycle, from which the lengths of steps follow."""
         if self.usual is not None:
-            return self.usual(machine) if callable(self.usual) else self.usual
+            if not callable(self.usual):
+                return self.usual
+            whose = f"`usual` in the `cycle` of a {type(machine).__name__}"
+            return returned(self.usual(machine), whose, "about how long a cycle takes")
         raise ValueError(
             f"Argument `usual` must be given with the `cycle` of a {type(machine).__name__}: about "
             "how long a cycle takes."
@@ -55,7 +58,9 @@ class Counter(abc.ABC):
                 f"names {self.name!r}."
             )
         try:
-            return self.name(machine, state) if callable(self.name) else component(self.name, state)
+            if not callable(self.name):
+                return component(self.name, state)
+            return returned(self.name(machine, state), f"The function in {whose}", "a number")
         except (AttributeError, LookupError) as error:
             raise TypeError(f"{whose} must be computable, but: {error}") from error
 

@@ -225,7 +225,10 @@ def _called(
     given = *first, s, past.own(state), past(machine, s, state), *modes
     words = "the machine, `t`, the state, the past" if first else "`t`, the state, the past"
     check_takes(function, whose, words, given, len(modes))
-    return function(*given)
+    try:
+        return function(*given)
+    except (AttributeError, LookupError) as error:
+        raise TypeError(f"{whose} must be computable, but: {error}") from error
 
 
 @dataclasses.dataclass(frozen=True)

@@ -158,6 +158,21 @@ def without_history(machine: Any, state: Any) -> Any:
     return state if machine_of_chain(machine) is None else machine._past.own(state)
 
 
+def check_history(name: str, machine: Any, state: Any) -> None:
+    """**Raises:** `TypeError` if a state of a chain, the argument `name`, lacks its history."""
+    if machine_of_chain(machine) is None:
+        return
+    chain = machine._past
+    wanted = chain.nodes * chain.elements, chain.form.size
+    found = vars(state).get(_NAME) if isinstance(state, Named) else None
+    if found is None or jnp.shape(found)[-2:] != wanted:
+        got = "has none" if found is None else f"has one of shape {jnp.shape(found)}"
+        raise TypeError(
+            f"Argument `{name}` must have the `history` of a `delay_chain`, of shape {wanted}, but "
+            f"{got}. Pass `machine.chained({name})`, a state or the `last` of a run without it."
+        )
+
+
 def history_in(machine: Any, state: Any) -> Callable[[Scalar], Vector]:
     """Return the history in a state of a chain, as a function of t ≤ 0."""
     zero, own, longest = jnp.zeros((), float), without_modes(state), longest_delay(machine)

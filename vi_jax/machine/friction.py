@@ -212,7 +212,8 @@ class DryFriction(Friction):
     - `push`: instead of `on` and `mass`, the change of the rate of each component by a unit of
       force, by name, if the friction acts on several.
     - `load(z)`, `load(t, z)` or `load(machine, t, z)`: a factor of the level, not negative: the
-      normal force N, if it varies; `level` is then μ. 1 by default.
+      normal force N, if it varies; `level` is then μ. 1 by default. A lane in which it becomes
+      negative ends as `RESULTS.jammed`; `jnp.maximum(N, 0)` is the load of a body that lifts off.
     - `static_ratio`: μ_s/μ, at least 1.
     """
 
@@ -247,6 +248,18 @@ class DryFriction(Friction):
         if self.slip is not None:
             return jnp.asarray(call_law(self.slip, machine, s, state))
         return machine._coordinate_on(self.on, self.mass).velocity(state)
+
+    def laws(self) -> dict[str, Any]:
+        """Return what the user gives as functions of machine, time and state, by argument."""
+        given = {"slip": self.slip, "load": self.load}
+        found: dict[str, Any] = {
+            name: functools.partial(call_law, f) for name, f in given.items() if f is not None
+        }
+        if self.slip is None:
+            found["on"] = self.speed_of_slip
+        if callable(self.level):
+            found["level"] = lambda *here: self.level(self.speed_of_slip(*here))
+        return found
 
     def row(self, machine: Machine, s: Scalar, state: State) -> Row:
         """Return the slip's row in the equations of contacts."""
@@ -284,6 +297,22 @@ class DryFriction(Friction):
     def sticking(self, machine: Machine, s: Scalar, state: State) -> Any:
         """Return the largest force that friction can balance on a body at rest."""
         return self.sliding(machine, s, state, jnp.zeros_like(s)) * self.static_ratio
+
+    @property
+    def may_be_negative(self) -> bool:
+        """True if the size of the force is computed by functions; static."""
+        return callable(self.level) or self.load is not None
+
+    def is_negative(
+        self, machine: Machine, old: tuple[Any, State], new: tuple[Any, State], mode: Scalar
+    ) -> Flag:
+        """Return whether the size of the force, which was that of `old` a step ago, is negative by
+        more than rounding of its terms. States are pairs of time and state."""
+        old, (s, state), mode = stop_gradient((old, new, mode))
+        force = lambda x: jnp.asarray(self.sliding(machine, s, x, mode))
+        size = size_of(force, state, jtu.tree_map(jnp.abs, state))
+        size = size + jnp.abs(self.sliding(machine, *old, mode))
+        return stop_gradient(force(state) < -1e-9 * size)
 
     def static_share(self, machine, s, state):
         return self.static_ratio
@@ -326,6 +355,14 @@ class JointFriction(DryFriction):
 
     def sticking(self, machine, s, state):
         return self._total(lambda x: x.sticking(machine, s, state))
+
+    @property
+    def may_be_negative(self):
+        return any(x.may_be_negative for x in self.parts)
+
+    def is_negative(self, machine, old, new, mode):
+        parts = [x for x in self.parts if x.may_be_negative]
+        return jnp.any(jnp.stack([x.is_negative(machine, old, new, mode) for x in parts]))
 
     def static_share(self, machine, s, state):
         kinetic = self.sliding(machine, s, state, jnp.zeros_like(s))

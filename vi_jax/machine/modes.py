@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
 
+from .._checks import returned
 from .._types import Machine, Scalar, State, Vector
 from .event import Modes
 from .parts import (
@@ -29,7 +30,10 @@ def own_modes(machine: Machine, modes: Modes) -> Modes:
 def modes_at_start(machine: Machine, s: Scalar, state: State) -> tuple[Any, ...]:
     """Return the machine's own initial modes of a motion that begins in `state`."""
     modes = machine.modes
-    return _values(modes(s, state) if callable(modes) else declared_modes(machine))
+    if not callable(modes):
+        return _values(declared_modes(machine))
+    whose = f"`modes` of a {type(machine).__name__}"
+    return _values(returned(modes(s, state), whose, "the modes at the start"))
 
 
 def _values(modes: Any) -> tuple[Any, ...]:

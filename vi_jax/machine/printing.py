@@ -14,16 +14,19 @@ from jax.core import Tracer
 
 from .._checks import on_host
 from .._types import State
-from .leaves import components, first_few, near_names
+from .leaves import by_name, components, first_few, near_names
 from .units import NONE, in_unit, unit_of, with_unit
 
 
 def state_in_words(state: State, digits: int, units: Mapping[str, str]) -> str:
-    """Return the numbers of a state with their units, as text; of a long state the first few."""
+    """Return the numbers of a state with their units, as text; of a long state the first few, of
+    an array with several axes, such as the history of a `delay_chain`, their range."""
     # JAX sorts the names of a dictionary, but not those of an `OrderedDict`.
-    parts = components(OrderedDict(state) if isinstance(state, Mapping) else state).items()
+    leaves = by_name(OrderedDict(state) if isinstance(state, Mapping) else state)
+    parts = components(OrderedDict((k, x) for k, x in leaves.items() if np.ndim(x) < 2)).items()
     size = max((abs(float(x)) for _, x in parts), default=0.0)
     words = [f"{k} = {in_unit(plain(x, digits, size), units, k)}" for k, x in parts]
+    words += [f"{k} = {number_in_words(x)}" for k, x in leaves.items() if np.ndim(x) > 1]
     return ", ".join(first_few(words))
 
 

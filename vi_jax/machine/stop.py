@@ -30,6 +30,7 @@ from .._checks import (
     real_or_law,
     require,
     require_ranges,
+    returned,
 )
 from .._types import Machine, Number, Scalar, State
 from .contacts import push_of, shown_modes
@@ -187,7 +188,10 @@ class RigidStop(Wall, AbstractEvent):
 
     def coefficient(self, approach: object) -> Any:
         """Return k at this speed of approach."""
-        return self.restitution(approach) if callable(self.restitution) else self.restitution
+        if not callable(self.restitution):
+            return self.restitution
+        whose = f"`restitution` of a {type(self).__name__}"
+        return returned(self.restitution(approach), whose, "a number")
 
     def velocity_after(self, V: Number, coefficient: Any = None) -> Any:
         """Return the velocity after an impact with velocity `V` (Eq. 17 of the paper), with this

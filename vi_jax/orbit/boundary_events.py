@@ -5,6 +5,7 @@
 | a bound is reached | distance of the parameter | `bounds` |
 | another impact is lost, a stop touched | V⁻, least distance at a turn | `grazing` |
 | another chatter takes until the release | the time left | `rest` |
+| a part with a mode of a switch vanishes | its length; 1 or -1 for another mode | sliding |
 | a pair of multipliers becomes real | 1 ∓ the cosine of its angle | `resonance-1:1`, `-1:2` |
 | the motion becomes its own image | its difference from that | `symmetry-breaking` |
 | the curve closes | distance to the plane across an earlier point | `closed` |
@@ -22,9 +23,20 @@ from .conditions import Special
 from .corrector import Step, distance_along
 from .edit_events import may_be_symmetric
 from .equations import Shooting
-from .kinds import GRAZING, RESONANCE_1, RESONANCE_2, REST, SYMMETRY, TORUS, TOUCHING
+from .kinds import (
+    CROSSING_SLIDING,
+    GRAZING,
+    RESONANCE_1,
+    RESONANCE_2,
+    REST,
+    SWITCHING_SLIDING,
+    SYMMETRY,
+    TORUS,
+    TOUCHING,
+)
 from .locate import MOST_SAMPLES, SPACING, crossing
-from .tolerances import ALIKE, ROUNDING, SAME
+from .sliding import change_at_event, vanishing_part
+from .tolerances import ALIKE, FAINT, ROUNDING, SAME
 from .walk import Ending, Event, Table, bound_rows
 
 # The intervals of the first and of the second parameter.
@@ -53,8 +65,8 @@ class SpecialTable(Table):
 
     def event_rows(self, here: Step, new: Step) -> list[Event]:
         return [
-            *bound_rows(self), *self._grazing_rows(here), *self._resonance_rows(),
-            *self._symmetry_rows(here), *self.closing.rows(here, new),
+            *bound_rows(self), *self._grazing_rows(here), *self._sliding_rows(),
+            *self._resonance_rows(), *self._symmetry_rows(here), *self.closing.rows(here, new),
         ]  # fmt: skip
 
     def _grazing_rows(self, here: Step) -> Iterator[Event]:
@@ -81,6 +93,20 @@ class SpecialTable(Table):
             slack = 2 * ROUNDING if kind == GRAZING else 0.0
             clearance = lambda step: step.observed.relative_clearance + slack
             yield Event(clearance, lambda at: Ending(at, GRAZING), noise=ROUNDING)
+
+    def _sliding_rows(self) -> Iterator[Event]:
+        """Yield the rows of the order of events, but those of a grazing or of a rest coincide; and
+        of a switch that goes into another mode, unless an event is at the limit of that."""
+        kind, names = self.condition.kind, ["order_margin", "modes_agree"]
+        if kind in (CROSSING_SLIDING, SWITCHING_SLIDING):
+            names = names[:1]
+        for name in () if kind in (GRAZING, REST) else names:
+            test = lambda step, name=name: float(getattr(step.observed, name))
+            yield Event(test, self._sliding_ending, noise=ROUNDING)
+
+    def _sliding_ending(self, at: Step) -> Ending:
+        change = vanishing_part(self.problem, at, FAINT) or change_at_event(self.problem, at)
+        return Ending(at, (change and change.kind) or GRAZING)
 
     def _grazing_ending(self, here: Step, test: Callable[[Step], float], at: Step) -> Ending:
         """Return the end at a grazing impact, where the monodromy matrix has a pole."""

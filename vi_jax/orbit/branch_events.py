@@ -60,7 +60,7 @@ from .kinds import (
 )
 from .locate import SPACING, crossing, dip_of, passes_zero
 from .results import Orbit
-from .sliding import change_at, locate_change
+from .sliding import change_at, locate_change, vanishing_part
 from .special import Point, further_of, point_at
 from .tolerances import ALIKE, BRIEF, FAINT, LOCATED, NEARBY, ON_CIRCLE, ROUNDING, SAME
 from .walk import SAME_CURVE, Ending, Event, Table, bound_rows
@@ -396,6 +396,8 @@ class MotionTable(Table):
             return []  # rounding: the tangent is ill-defined close to a crossing of branches
         if kind in (FOLD, TURNS, CROSSING) and self._shrinks_to_rest(here, at, last):
             return []  # a multiplier is 1 there to rounding
+        if kind in (FOLD, TURNS, CROSSING) and vanishing_part(self.problem, at, FAINT):
+            return []  # a part of the motion vanishes: solutions with and without it cross
         if kind in (FOLD, TURNS, CROSSING) and self._begins_at(here, at):
             return []  # both tests are zero there
         if held and kind == TURNS:

@@ -22,6 +22,7 @@ from ..machine import (
     modes_of,
     without_modes,
 )
+from .cycle_map import axes_of
 from .results import Orbit, distance
 from .tolerances import SAME
 
@@ -41,7 +42,7 @@ def as_chain(machine: AbstractMachine, guess: Any) -> tuple[AbstractMachine, Any
     if guess is None or isinstance(guess, Orbit):
         return delay_chain(machine), guess
     state = without_modes(guess)
-    is_batch = jnp.ndim(machine.position(state)) > 0
+    is_batch = axes_of(machine, state) > 0
     first = jax.tree.map(lambda x: x[0], state) if is_batch else state
     chain: Any = delay_chain(machine, start=first)
     return chain, (jax.vmap(chain.chained) if is_batch else chain.chained)(guess)

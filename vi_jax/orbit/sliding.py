@@ -68,10 +68,10 @@ def change_at(problem: Shooting, at: Step) -> Change | None:
     if not problem.modes[0]:
         return None
     found = (
-        _vanishing_part(problem, at, FAINT)
+        vanishing_part(problem, at, FAINT)
         or _touching_part(problem, at)
-        or _change_at_event(problem, at)
-        or _vanishing_part(problem, at, NEARBY)  # a corrector may not get closer
+        or change_at_event(problem, at)
+        or vanishing_part(problem, at, NEARBY)  # a corrector may not get closer
     )
     return found if found is not None and found.kind is not None else None
 
@@ -80,7 +80,7 @@ def _mode(problem: Shooting, leg: int, number: int) -> float:
     return float(problem.modes[leg % problem.legs][mode_number(problem.machine, number)])
 
 
-def _vanishing_part(problem: Shooting, at: Step, brief: float) -> Change | None:
+def vanishing_part(problem: Shooting, at: Step, brief: float) -> Change | None:
     """Return the briefest part between two events of one switch, if shorter than this share."""
     (clock, _, period), lengths = problem.values(at.x), problem.lengths(at.x)
     events, found = problem.events, []
@@ -110,7 +110,7 @@ def _touching_part(problem: Shooting, at: Step) -> Change | None:
     return Change(number, place, (mode, 0.0, mode), False) if excess < LOCATED else None
 
 
-def _change_at_event(problem: Shooting, at: Step) -> Change | None:
+def change_at_event(problem: Shooting, at: Step) -> Change | None:
     """Return an event of a switch at the limit of being held there."""
     clock, found = problem.values(at.x)[0], []
     for i, event in enumerate(problem.events):

@@ -182,7 +182,7 @@ def run_blocks(
             at_once = place.workers
             if place.devices > 1 or jax.default_backend() != "cpu":
                 at_once = 1
-            elif todo and at_once > 1:
+            elif len(todo) > 1 and at_once > 1:
                 # Compiled here once, not in several threads.
                 compute(program, blocks.values(todo[0]), blocks.lanes, dry=True)
             pool = stack.enter_context(futures.ThreadPoolExecutor(at_once))

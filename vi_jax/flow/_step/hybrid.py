@@ -248,6 +248,11 @@ def _faults(
     reason. `new` is the lane after the trial."""
     impacts, broken = new.record.impacts, code("not_finite")
     jams = [(jnp.isnan(new.modes[i]), code("jammed")) for i in frictions_in(plan.machine)]
+    for i, x in enumerate(switches_of(plan.machine)):
+        if isinstance(x, DryFriction) and x.may_be_negative:
+            old, at = (lane.s, lane.state), (new.s, new.state)
+            negative = x.is_negative(plan.machine, old, at, new.modes[i])
+            jams.append((taken & negative, code("jammed")))
     many = impacts > _MOST_IMPACTS
     if is_alive(plan.machine, trial.state) is not None:
         # If a clock breaks down, the steps shrink to zero.
