@@ -498,7 +498,7 @@ def _hold_resting(
         # A body that sticks has no slip, not even one of second order in the wait.
         still = on_held_surfaces(plan.machine, end, still, modes, contact)
     if len(rests) > 1:  # another body may reach this one before its impacts are over
-        clear = ~plan.beyond_a_stop(still)
+        clear = ~plan.beyond_a_stop(still, before=state)
         blocked = jnp.where(any_of(clear, rests.values()) & ~clear, 1.0, blocked)
         rests = {k: ends & clear for k, ends in rests.items()}
         contact = select(clear, contact, lane.contact)
@@ -670,9 +670,9 @@ def _resting_bodies(
     before: Scalar,
 ) -> tuple[dict[int, Flag], dict[int, Scalar]]:  # fmt: skip
     """Return for each coordinate that was struck, or is nearly, whether it comes to rest in a
-    shorter time than `before`, and that time. `distances` are those from the stops. A body may be pressed on by another that
-    comes to rest at the same instant. Therefore each is tested while those of the others that rest
-    so far and are pressed on are held, until none changes."""
+    shorter time than `before`, and that time. `distances` are those from the stops. A body may be
+    pressed on by another that comes to rest at the same instant. Therefore each is tested while
+    those of the others that rest so far and are pressed on are held, until none changes."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     free = in_modes(plan.machine, lane.modes)
