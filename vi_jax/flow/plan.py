@@ -139,12 +139,16 @@ class Plan(eqx.Module):
         """Return bounds of the rounding errors of position and velocity of coordinate number k."""
         return rounding_bounds(self.machine, k, state, self.extent(k), self.unit)
 
-    def beyond_a_stop(self, state: State) -> Flag:
-        """Return whether a coordinate is beyond one of its stops by more than rounding."""
+    def beyond_a_stop(self, state: State, before: State | None = None) -> Flag:
+        """Return whether a coordinate is beyond one of its stops by more than rounding, and further
+        than `before`."""
         beyond = jnp.zeros((), bool)
         for stop in stops_of(self.machine):
             position = self.machine.coordinates[stop.coordinate].position(state)
             slack, _ = self.rounding_bounds(stop.coordinate, state)
+            if before is not None:
+                old = self.machine.coordinates[stop.coordinate].position(before)
+                slack = slack + jnp.maximum(stop_gradient(stop.beyond(old)), 0.0)
             beyond = beyond | (stop_gradient(stop.beyond(position)) > slack)
         return beyond
 

@@ -403,12 +403,17 @@ def bring_to_rest(
             ((k, impact),) = impacts.items()
             arguments = k, impact, speeds[k], lane._replace(state=at_event)
             ends, time = _remaining_chatter(plan, free[k], *arguments)
-            near, times = impacts, {k: time}
             rests = {k: pin_flag((impact.contact > 0) & ends, lane.s)}
-        else:
-            near, distances = _near_contacts(plan, lane, met, impacts)
-            rests, times = _resting_bodies(plan, lane, near, distances)
-        return _hold_resting(plan, step.taken, lane, at_event, rests, near, times)
+            return _hold_resting(plan, step.taken, lane, at_event, rests, impacts, {k: time})[0]
+        near, distances = _near_contacts(plan, lane, met, impacts)
+
+        def hold(found: tuple[Lane, Scalar, Scalar]) -> tuple[Lane, Scalar, Scalar]:
+            rests, times = _resting_bodies(plan, lane, near, distances, before=found[1])
+            return _hold_resting(plan, step.taken, lane, at_event, rests, near, times)
+
+        # If another body would reach one that rests, only those rest whose impacts are over first.
+        begin = lane, lane.s + jnp.inf, jnp.ones_like(lane.s)
+        return jax.lax.while_loop(lambda found: found[2] > 0, hold, begin)[0]
 
     # Rare: skipped if no lane of a group may come to rest.
     return jax.lax.cond(pin_flag(met & slow, lane.s), rest, lambda lane: lane, lane)
@@ -460,13 +465,14 @@ def _near_contacts(
 def _hold_resting(
     plan: Plan, taken: Flag, lane: Lane, at_event: State, rests: dict[int, Flag],
     impacts: dict[int, ImpactResult], times: dict[int, Scalar],
-) -> Lane:  # fmt: skip
+) -> tuple[Lane, Scalar, Scalar]:  # fmt: skip
     """Return the lane after the infinitely many last impacts, with those bodies held that come to
-    rest; `at_event` is the state before the impacts. For each coordinate: `rests`, whether it does;
-    `times`, the time until then (in s)."""
+    rest; the time that these impacts take; and 1 if none is held, since another body would reach
+    one before. `at_event` is the state before the impacts. For each coordinate: `rests`, whether it
+    comes to rest; `times`, the time until then (in s)."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
-    wait = jnp.zeros_like(s)
+    wait = blocked = jnp.zeros_like(s)
     for k, ends in rests.items():
         time = jnp.where(ends, times[k], 0.0)
         wait = time if len(rests) == 1 else jnp.maximum(wait, time)
@@ -492,7 +498,8 @@ def _hold_resting(
         # A body that sticks has no slip, not even one of second order in the wait.
         still = on_held_surfaces(plan.machine, end, still, modes, contact)
     if len(rests) > 1:  # another body may reach this one before its impacts are over
-        clear = ~plan.beyond_a_stop(still)
+        clear = ~plan.beyond_a_stop(still, before=state)
+        blocked = jnp.where(any_of(clear, rests.values()) & ~clear, 1.0, blocked)
         rests = {k: ends & clear for k, ends in rests.items()}
         contact = select(clear, contact, lane.contact)
     any_rests = any_of(taken, rests.values())
@@ -508,7 +515,7 @@ def _hold_resting(
     if energy is not None:
         energy = energy + jnp.where(taken & any_rests, lost, 0.0)
         lane = lane.update_record(impact_energy=energy)
-    return lane
+    return lane, wait, blocked
 
 
 def _stuck_by_then(
@@ -659,12 +666,13 @@ def _remaining_contacts(
 
 
 def _resting_bodies(
-    plan: Plan, lane: Lane, impacts: dict[int, ImpactResult], distances: dict[int, Scalar]
-) -> tuple[dict[int, Flag], dict[int, Scalar]]:
-    """Return for each coordinate that was struck, or is nearly, whether it comes to rest, and the
-    time until then. `distances` are those from the stops. A body may be pressed on by another that
-    comes to rest at the same instant. Therefore each is tested while those of the others that rest
-    so far and are pressed on are held, until none changes."""
+    plan: Plan, lane: Lane, impacts: dict[int, ImpactResult], distances: dict[int, Scalar],
+    before: Scalar,
+) -> tuple[dict[int, Flag], dict[int, Scalar]]:  # fmt: skip
+    """Return for each coordinate that was struck, or is nearly, whether it comes to rest in a
+    shorter time than `before`, and that time. `distances` are those from the stops. A body may be
+    pressed on by another that comes to rest at the same instant. Therefore each is tested while
+    those of the others that rest so far and are pressed on are held, until none changes."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     free = in_modes(plan.machine, lane.modes)
@@ -692,7 +700,8 @@ def _resting_bodies(
                 plan, free_k, k, hit, speeds[k], lane, distance=distances[k]
             )
             spare = held[k] < 0  # it rests when those rest that hold it
-            ends, time = (hit.contact > 0) & (ends | spare), jnp.where(spare, 0.0, time)
+            time = jnp.where(spare, 0.0, time)
+            ends = (hit.contact > 0) & (ends | spare) & (stop_gradient(time) < before)
             new[k] = jnp.where(ends, hit.contact, contact[k])
             times.append(jnp.where(ends, time, 0.0))
         changed = jnp.zeros((), bool)
