@@ -1,55 +1,42 @@
 """The names that other packages import; `__init__.py` loads those for branches and tori late."""
 
-from .birkhoff import QUASIPERIODIC as QUASIPERIODIC
-from .birkhoff import WANDERS as WANDERS
-from .birkhoff import agreement as agreement
-from .birkhoff import digits_of as digits_of
-from .birkhoff import rotation_number as rotation_number
-from .birkhoff import weights as weights
-from .birkhoff import without_angles as without_angles
-from .closed_form import ClosedFormOrbits as ClosedFormOrbits
-from .closed_form import closed_form_orbits as closed_form_orbits
-from .continuation import boundary as boundary
-from .continuation import continue_orbit as continue_orbit
-from .curve import Boundary as Boundary
-from .curve import Branch as Branch
-from .curve import branch_hits_in_words as branch_hits_in_words
-from .curve import column_names as column_names
-from .cycle_map import CycleMap as CycleMap
-from .cycle_map import cycle_map as cycle_map
-from .cycle_map import map_state as map_state
+# ruff: noqa: I001
+# fmt: off
+from .birkhoff import (
+    QUASIPERIODIC as QUASIPERIODIC, WANDERS as WANDERS, agreement as agreement,
+    digits_of as digits_of, rotation_number as rotation_number, weights as weights,
+    without_angles as without_angles,
+)
+from .closed_form import (
+    ClosedFormOrbits as ClosedFormOrbits, closed_form_orbits as closed_form_orbits,
+)
+from .continuation import boundary as boundary, continue_orbit as continue_orbit
+from .curve import (
+    Boundary as Boundary, Branch as Branch, branch_hits_in_words as branch_hits_in_words,
+    column_names as column_names,
+)
+from .cycle_map import CycleMap as CycleMap, cycle_map as cycle_map, map_state as map_state
 from .delay import as_chain as as_chain
-from .find import find_orbit as find_orbit
-from .find import is_equilibrium as is_equilibrium
+from .find import find_orbit as find_orbit, is_equilibrium as is_equilibrium
 from .forecast import SCENARIOS as SCENARIOS
-from .grazing import Grazing as Grazing
-from .grazing import Motions as Motions
+from .grazing import Grazing as Grazing, Motions as Motions
 from .kinds import KINDS as KINDS
-from .results import ORBIT_RESULTS as ORBIT_RESULTS
-from .results import STABILITY as STABILITY
-from .results import MotionSections as MotionSections
-from .results import Orbit as Orbit
-from .results import Orbits as Orbits
-from .results import check_multipliers as check_multipliers
-from .results import distance as distance
-from .results import distinct_among as distinct_among
-from .results import distinct_orbits as distinct_orbits
-from .results import in_one_line as in_one_line
-from .results import index_of as index_of
-from .results import multipliers_in_words as multipliers_in_words
-from .results import multipliers_of as multipliers_of
-from .results import stability_of as stability_of
-from .root_finders import AbstractRootFinder as AbstractRootFinder
-from .root_finders import Gradient as Gradient
-from .root_finders import Newton as Newton
+from .results import (
+    ORBIT_RESULTS as ORBIT_RESULTS, STABILITY as STABILITY, MotionSections as MotionSections,
+    Orbit as Orbit, Orbits as Orbits, check_multipliers as check_multipliers, distance as distance,
+    distinct_among as distinct_among, distinct_orbits as distinct_orbits,
+    in_one_line as in_one_line, index_of as index_of, multipliers_in_words as multipliers_in_words,
+    multipliers_of as multipliers_of, stability_of as stability_of,
+)
+from .root_finders import (
+    AbstractRootFinder as AbstractRootFinder, Gradient as Gradient, Newton as Newton,
+)
 from .special import Point as Point
-from .tolerances import ALIKE as ALIKE
-from .tolerances import CORRECTED as CORRECTED
-from .tolerances import FAINT as FAINT
-from .tolerances import LOCATED as LOCATED
-from .tolerances import ROUNDINGS as ROUNDINGS
-from .torus import Torus as Torus
-from .torus import find_torus as find_torus
-from .torus_branch import TorusBranch as TorusBranch
-from .torus_branch import Window as Window
-from .torus_branch import continue_torus as continue_torus
+from .tolerances import (
+    ALIKE as ALIKE, CORRECTED as CORRECTED, FAINT as FAINT, LOCATED as LOCATED,
+    ROUNDINGS as ROUNDINGS,
+)
+from .torus import Torus as Torus, find_torus as find_torus
+from .torus_branch import (
+    TorusBranch as TorusBranch, Window as Window, continue_torus as continue_torus,
+)
