@@ -24,6 +24,7 @@ from ._program import LaneProgram, batch_of, dependent_parts, shape_of
 from ._shared import set_within
 from ._vector import Unsupported
 from .call import header, register_handler
+from .elementary import run_outside_jit
 from .runtime import AnyProgram, kernel_of
 
 _vector_only: ContextVar[bool] = ContextVar("strict", default=False)
@@ -44,11 +45,7 @@ def primitive_of_programs(name: str) -> Primitive:
         batch = batch_of(program, [a.shape for a in args])
         return [ShapedArray((*batch, *a.shape), a.dtype) for a in program.result_avals]
 
-    @functools.lru_cache(64)
-    def compiled(**parameters):
-        return jax.jit(functools.partial(primitive.bind, **parameters))
-
-    primitive.def_impl(lambda *args, **parameters: compiled(**parameters)(*args))
+    run_outside_jit(primitive)
     return primitive
 
 

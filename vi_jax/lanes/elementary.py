@@ -27,6 +27,16 @@ def horner(coefficients: tuple, x):
     return value
 
 
+def run_outside_jit(primitive: Primitive) -> None:
+    """Let a primitive run outside `jit`, too: by a compiled program for each set of parameters."""
+
+    @functools.lru_cache(64)
+    def compiled(**params):
+        return jax.jit(functools.partial(primitive.bind, **params))
+
+    primitive.def_impl(lambda *args, **params: compiled(**params)(*args))
+
+
 def elementwise_primitive(
     name: str, function: Callable[..., Any], jvp: Callable[..., Any] | None = None, results: int = 1
 ) -> Primitive:
@@ -34,10 +44,6 @@ def elementwise_primitive(
     results have the type of the last argument."""
     primitive = Primitive(name)
     primitive.multiple_results = several = results > 1
-
-    @functools.cache
-    def compiled(**params):
-        return jax.jit(functools.partial(function, **params))
 
     def shaped(*args, **params):
         weak = all(x.weak_type for x in args)
@@ -56,7 +62,7 @@ def elementwise_primitive(
         return out, [0] * results if several else 0
 
     primitive.def_abstract_eval(shaped)
-    primitive.def_impl(lambda *args, **params: compiled(**params)(*args))
+    run_outside_jit(primitive)
     mlir.register_lowering(primitive, mlir.lower_fun(function, multiple_results=several))
     batching.primitive_batchers[primitive] = batched
     if jvp is not None:

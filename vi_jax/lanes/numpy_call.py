@@ -3,7 +3,6 @@
 XLA would compile it for longer than a search for an orbit takes, and for LAPACK JAX loads SciPy.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,6 +15,7 @@ from jax.interpreters import batching, mlir
 
 from ._vector import Unsupported
 from .call import header, numpy_key, register_handler
+from .elementary import run_outside_jit
 
 
 def call_numpy(
@@ -35,14 +35,7 @@ numpy_call_p = Primitive("numpy_call")
 numpy_call_p.multiple_results = True
 
 
-@numpy_call_p.def_impl
-def _(*arrays, **parameters):
-    return _compiled(**parameters)(*arrays)
-
-
-@functools.lru_cache(64)
-def _compiled(**parameters):
-    return jax.jit(functools.partial(numpy_call_p.bind, **parameters))
+run_outside_jit(numpy_call_p)
 
 
 @numpy_call_p.def_abstract_eval
@@ -63,17 +56,20 @@ def _batched(arrays, dims, *, function, shapes, batch):
 batching.primitive_batchers[numpy_call_p] = _batched
 
 
+def _results(arrays, shapes, batch):
+    return [jax.ShapeDtypeStruct((*batch, *shape), arrays[0].dtype) for shape in shapes]
+
+
 def _by_handler(*arrays, function, shapes, batch):
-    results = [jax.ShapeDtypeStruct((*batch, *x), arrays[0].dtype) for x in shapes]
     head = header(numpy_key(function), 0, [0] * len(arrays))
-    return jax.ffi.ffi_call(register_handler(), results)(head, *arrays)
+    call = jax.ffi.ffi_call(register_handler(), _results(arrays, shapes, batch))
+    return call(head, *arrays)
 
 
 def _by_callback(*arrays, function, shapes, batch):
     kind = arrays[0].dtype
     call = lambda *x: [np.asarray(y, kind) for y in function(*map(np.asarray, x))]
-    results = [jax.ShapeDtypeStruct((*batch, *x), kind) for x in shapes]
-    return jax.pure_callback(call, results, *arrays)
+    return jax.pure_callback(call, _results(arrays, shapes, batch), *arrays)
 
 
 _lowered_by_callback = mlir.lower_fun(_by_callback, multiple_results=True)
