@@ -140,6 +140,9 @@ def assert_calls_numpy():
 
 def test_numpy_functions_in_programs():
     assert_calls_numpy()
+    with jax.disable_jit():
+        assert_calls_numpy()
+        np.testing.assert_allclose(fall(1.0, 9.8125)[0], fall(jnp.ones(()), 9.8125)[0])
     with pytest.raises(jax.errors.JaxRuntimeError, match="ValueError: could not be"):
         jax.block_until_ready(lanes.call_numpy(failing_function, [()], 1.0))
 

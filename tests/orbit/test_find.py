@@ -281,7 +281,7 @@ def test_a_motion_of_five_cycles():
 def test_invalid_arguments_raise():
     for arguments, message in (
         ({"cycles": 0}, "`cycles` must be at least 1"),
-        ({"root_finder": vi.Newton(arcs=3), "cycles": 4}, "arcs that divides the 4 cycles"),
+        ({"root_finder": vi.Newton(arcs=3), "cycles": 4}, "arcs that divides 4 cycles"),
     ):
         with pytest.raises(ValueError, match=message):
             vi.find_orbit(UNDAMPED, UNDAMPED.start(), **arguments)
@@ -311,6 +311,19 @@ def sledge_speeds(damping):
     """Return both velocities at s = 0, from the responses of sum and difference."""
     both, apart = 1 / (1j + damping), 1j / (1 + 1j * damping)
     return (both + apart).real / 2, (both - apart).real / 2
+
+
+class Free(vi.AbstractMachine):
+    cycle: float = 2 * np.pi / 50
+
+    def field(self, t, z):
+        return dict(x=z.u, u=-2500.0 * z.x)
+
+
+def test_where_every_motion_repeats_the_guess_is_the_orbit():
+    """All singular values of the equations are rounding: it led away from the guess, to rest."""
+    orbit = vi.find_orbit(Free(), vi.State(x=-0.01, u=0.0), method="reference")
+    assert bool(orbit.successful) and float(orbit.state.x) == pytest.approx(-0.01, abs=1e-12)
 
 
 @pytest.mark.exhaustive

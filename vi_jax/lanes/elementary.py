@@ -34,7 +34,10 @@ def run_outside_jit(primitive: Primitive) -> None:
     def compiled(**params):
         return jax.jit(functools.partial(primitive.bind, **params))
 
-    primitive.def_impl(lambda *args, **params: compiled(**params)(*args))
+    @primitive.def_impl
+    def _(*args, **params):
+        with jax.disable_jit(False):  # else the program would be this function again
+            return compiled(**params)(*args)
 
 
 def elementwise_primitive(

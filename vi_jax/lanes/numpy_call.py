@@ -66,6 +66,8 @@ def _by_handler(*arrays, function, shapes, batch):
     return call(head, *arrays)
 
 
+# Several threads at once may wait for each other here on a CPU with few cores: see
+# https://github.com/jax-ml/jax/issues/25861. It is used on a GPU, and without LLVM.
 def _by_callback(*arrays, function, shapes, batch):
     kind = arrays[0].dtype
     call = lambda *x: [np.asarray(y, kind) for y in function(*map(np.asarray, x))]

@@ -19,4 +19,5 @@ from .birkhoff import (
 )
 from .tolerances import ALIKE, CORRECTED, FAINT, LOCATED, ROUNDINGS
 
-_, __getattr__ = on_first_access(__name__, __file__)
+__all__, __getattr__ = on_first_access(__name__, __file__)  # pyright: ignore
+__dir__ = lambda: __all__

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import count, flag
-from .._messages import warning_once
+from .._messages import count_of, warning_once
 from .._programs import compiled
 from .._types import Flag, Number, Scalar, Scalars, State, Vector
 from ..flow import (
@@ -58,7 +58,14 @@ from ..machine import (
 from .cycle_map import CycleMap, axes_of, batch_together, cycle_map, forward_jacobian, map_state
 from .delay import as_chain, with_delay_error
 from .results import ORBIT_RESULTS, Orbit, distance, multipliers_of, trimmed
-from .root_finders import AbstractRootFinder, Found, Newton, find_root, smallest_solution
+from .root_finders import (
+    AbstractRootFinder,
+    Found,
+    Newton,
+    find_root,
+    rounding,
+    smallest_solution,
+)
 
 
 def _residual(
@@ -350,13 +357,16 @@ def error_of(
     angles: np.ndarray | None, observed: ObservedArc, x: Float[Array, "arcs states"], sizes: Vector
 ) -> tuple[Scalar, Flag]:
     """Return the largest component of Newton's next step from the arcs' starts `x`, relative to
-    `sizes`, and whether the motion drifts. It drifts if no change of the starts reduces F much."""
+    `sizes`, and whether the motion drifts. It drifts if F is not rounding, and no change of the
+    starts reduces it much."""
     after = jnp.roll(x, -1, axis=0)
     residual = (nearest_images(angles, observed.states[:, -1, -1], after) - after).ravel()
     step = _start_change(observed.jacobians[:, -1], residual, sizes)
     remainder = residual - shooting_matrix(observed.jacobians[:, -1]) @ step
     sizes = jnp.tile(sizes, len(x))
-    drifts = jnp.linalg.norm(remainder / sizes) > _DRIFTS * jnp.linalg.norm(residual / sizes)
+    size = jnp.linalg.norm(residual / sizes)
+    drifts = jnp.linalg.norm(remainder / sizes) > _DRIFTS * size
+    drifts = drifts & (size > rounding(x.dtype))
     return jnp.max(jnp.abs(step / sizes)), drifts
 
 
@@ -449,8 +459,8 @@ def find_orbit(
     the_map = cycle_map(machine, cycles, method=method, section=section)
     if the_map.cycles % root_finder.arcs:
         raise ValueError(
-            "Argument `root_finder` must have a number of arcs that divides the "
-            f"{cycles} cycles, but has {root_finder.arcs} arcs."
+            "Argument `root_finder` must have a number of arcs that divides "
+            f"{count_of(the_map.cycles, 'cycle')}, but has {root_finder.arcs} arcs."
         )
     guess = the_map.machine.start() if guess is None else guess
     guess = guess.state if isinstance(guess, Orbit) else guess

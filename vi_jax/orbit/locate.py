@@ -139,7 +139,7 @@ def bracketed_zero(
         else:
             b, c, at_b, at_c = a, b, at_a, at_b
         a, at_a, share = place, value, 0.5
-        x, y = (a - b) / (c - b), (at_a - at_b) / (at_c - at_b)
+        x, y = (a - b) / (c - b), float(at_a - at_b) / float(at_c - at_b)
         if y**2 < x and (1 - y) ** 2 < 1 - x:
             share = at_a / (at_b - at_a) * at_c / (at_b - at_c)
             share += (c - a) / (b - a) * at_a / (at_c - at_a) * at_b / (at_c - at_b)

@@ -28,7 +28,8 @@ _STEEP = 1e3
 
 def rounding(dtype: object) -> float:
     """Return the share of the greatest singular value below which one is zero to rounding: 2e-12 in
-    double and 6e-6 in single precision."""
+    double and 6e-6 in single precision. If all are below it, so is the difference of the map's
+    derivative from 1."""
     return float(jnp.finfo(dtype).eps) ** 0.75
 
 
@@ -42,8 +43,8 @@ def smallest_solution(matrix: Matrix, right_side: Array) -> Array:
 def _missing_images(matrix: np.ndarray) -> list[np.ndarray]:
     """Return images of the directions without one, so that the matrix can be inverted."""
     left, sizes, right = svd(matrix)
-    is_zero = sizes <= rounding(matrix.dtype) * np.minimum(sizes[..., :1], _STEEP)
-    size = np.where(sizes[..., :1] > 0, sizes[..., :1], 1.0)
+    is_zero = sizes <= rounding(matrix.dtype) * np.clip(sizes[..., :1], 1.0, _STEEP)
+    size = np.maximum(sizes[..., :1], 1.0)
     return [(left * (is_zero * size)[..., None, :]) @ right]
 
 
@@ -184,11 +185,11 @@ def _newton_step(jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
     except np.linalg.LinAlgError:
         inverse = np.full_like(jacobian, np.nan)
     step = -np.einsum("...ij,...j->...i", inverse, residual)
-    condition = np.linalg.norm(jacobian, axis=(-2, -1)) * np.linalg.norm(inverse, axis=(-2, -1))
-    doubtful = ~(condition < 0.1 / rounding(jacobian.dtype))
+    size = np.maximum(np.linalg.norm(jacobian, axis=(-2, -1)), 1.0)
+    doubtful = ~(size * np.linalg.norm(inverse, axis=(-2, -1)) < 0.1 / rounding(jacobian.dtype))
     if doubtful.any():
         left, values, right = svd(jacobian[doubtful])
-        reachable = values > rounding(jacobian.dtype) * values[:, :1]
+        reachable = values > rounding(jacobian.dtype) * np.maximum(values[:, :1], 1.0)
         parts = np.einsum("ni,nij->nj", residual[doubtful], left)
         parts = np.where(reachable, parts / np.where(reachable, values, 1.0), 0.0)
         step[doubtful] = -np.einsum("ni,nij->nj", parts, right)
