@@ -256,8 +256,9 @@ def _check_period(kind: type, start: State, fields: list[np.ndarray], cycle: Any
     """Warn once if a cycle is no period of the field: its ends differ, or several are one."""
 
     def differ(rates: np.ndarray, a: int, b: int) -> bool:
-        size = np.maximum(abs(rates[1]), abs(rates[a]) + abs(rates[b]))
-        return bool(np.any(abs(rates[a] - rates[b]) > _PERIODIC * size))
+        with np.errstate(all="ignore"):  # rates that overflow are no fault here
+            size = np.maximum(abs(rates[1]), abs(rates[a]) + abs(rates[b]))
+            return bool(np.any(abs(rates[a] - rates[b]) > _PERIODIC * size))
 
     several = any(not any(differ(x, 1, k) for x in fields) for k in (4, 5, 6))
     paths = [jtu.keystr(path).lstrip(".") for path, _ in jtu.tree_leaves_with_path(start)]
