@@ -53,7 +53,7 @@ class NoModes(vi.AbstractEvent):
         (vi.Reset(lambda m, s, x: jnp.stack([x.Y, x.V]), back), r"`guard` of event 0 .* one float"),
         (vi.Reset(lambda m, s, x: x.Y > 0.5, back), r"`guard` of event 0 .* bool"),
         (vi.Reset(guard, lambda m, s, x: (x.Y, x.V)), r"state after event 0 \(Reset\) of a Swing"),
-        (vi.Reset(guard, lambda m, s, x: None), r"state after event 0 .* but is None"),
+        (vi.Reset(guard, lambda m, s, x: None), r"`reset` of a Reset .* `return` is missing"),
         (
             vi.Reset(guard, lambda m, s, x: vi.OscillatorState(x.Y[None], x.V), name="kick"),
             r"state after event 0 \(kick\) .*f64\[1\]",
