@@ -182,7 +182,8 @@ def _end_threads(frame: _Frame) -> None:
 
 
 def _run_kernel(frame: _Frame) -> int | None:
-    """Run all lanes of a call. Its first argument is `header`, the others are the inputs."""
+    """Run all lanes of a call, or a NumPy function. The first argument is `header`, the others are
+    the inputs."""
     arguments, results = frame.arguments, frame.results
     head = arguments.items[0].contents
     numbers = np.ctypeslib.as_array(

@@ -33,8 +33,6 @@ def call_numpy(
 
 numpy_call_p = Primitive("numpy_call")
 numpy_call_p.multiple_results = True
-
-
 run_outside_jit(numpy_call_p)
 
 

@@ -316,9 +316,9 @@ class Shooting(eqx.Module):
         return np.diff(clock, append=clock[:1] + period)
 
     def period(self, x: Unknowns) -> Any:
-        if self.autonomous:
-            return jnp.asarray(x[0])
         array = np if isinstance(x, np.ndarray) else jnp
+        if self.autonomous:
+            return array.asarray(x[0])
         return array.asarray(self.at(x).cycle, x.dtype) * self.cycles
 
     def pack(self, clock: Any, states: Any, x: Any, period: Any = None) -> Any:

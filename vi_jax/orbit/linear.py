@@ -1,5 +1,6 @@
 """Linear algebra of small matrices by NumPy, within compiled programs."""
 
+import functools
 from typing import Any
 
 import jax
@@ -24,15 +25,13 @@ def svd(matrix: Any) -> tuple[Any, Any, Any]:
 
 def solve(matrix: Matrix, right_side: Array) -> Array:
     """Return `jnp.linalg.solve(matrix, right_side)`; NaN for a singular matrix."""
-    shape = right_side.shape
 
-    def solved(matrix: Any, right: Any) -> Any:
-        return call_numpy(
-            _solved, [(shape[0], right.size // shape[0])], matrix, right.reshape(shape[0], -1)
-        )[0].reshape(shape)
+    def solved(matrix: Matrix, right_side: Array) -> Array:
+        columns = right_side.reshape(len(matrix), -1)
+        return call_numpy(_solved, [columns.shape], matrix, columns)[0].reshape(right_side.shape)
 
     return jax.lax.custom_linear_solve(
-        lambda x: jnp.matmul(matrix, x), right_side,
+        functools.partial(jnp.matmul, matrix), right_side,
         lambda _, b: solved(matrix, b), lambda _, b: solved(matrix.T, b),
     )  # fmt: skip
 

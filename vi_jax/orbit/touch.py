@@ -147,9 +147,10 @@ def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np
 
     def root(function: Callable[[float], Any], low: float, high: float) -> float:
         guard = lambda s1: float(function(s1)[1])
-        if guard(low) * guard(high) > 0:
-            raise NoLocalMapError(_TOO_STIFF)
-        return bracketed_zero(guard, low, high, tolerance=1e-15 * unit)
+        try:
+            return bracketed_zero(guard, low, high, tolerance=1e-15 * unit)
+        except ArithmeticError:
+            raise NoLocalMapError(_TOO_STIFF) from None
 
     def free_flight(s1):
         return _fly(problem, x, number, leg, False, s, s1, deep)
