@@ -278,7 +278,7 @@ def forces_in(
     return solve_modes(matrix, jnp.where(held, -x.rates, known))
 
 
-# So many dry frictions are settled without Lemke's method first: a choice.
+# So many rows without friction on contacts are settled without Lemke's method first: a choice.
 _FEW = 4
 
 # A row that depends on others to this share of its gain is redundant: a choice.
@@ -321,8 +321,8 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
     x, n = stop_gradient(x), x.closed.shape[0]
     if x.rates.shape == (1,):
         return _settle_one(x)
-    few_dry = has_ratios and not n and len(x.level) <= _FEW
-    found = _decide_dry(x) if few_dry else _decide_in_turn(x, of, has_ratios)
+    few = not of and len(x.rates) <= _FEW
+    found = _decide_quickly(x) if few else _decide_in_turn(x, of, has_ratios)
     pushed = x.gains @ found.force
     rate = pushed + x.rates
     size = jnp.max(jnp.abs(x.rates)) + jnp.max(jnp.abs(pushed))
@@ -352,40 +352,44 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
     return Settled(found.force, rate, kept, spare, mode, found.code != SOLVED)
 
 
-def _decide_dry(x: Contacts) -> _Decided:
-    """Return `_decide_in_turn` of dry frictions alone. Independent ones have one solution. So it is
-    found if all hold that may, or all but one that begins to slip. Other cases and ties are left to
-    Lemke's method: at each event of two frictions it took twice as long as all of the step."""
-    free, bound = x.slip == 0, x.hold * x.level
-    none = jnp.zeros((0,), bool)
+def _decide_quickly(x: Contacts) -> _Decided:
+    """Return `_decide_in_turn` without friction on contacts. If the rows that may act are
+    independent, there is one solution. So it is found if all contacts push and all frictions hold
+    that may, or all but one, which opens or begins to slip. Other cases and ties are left to
+    Lemke's method, which took as long as all of the step at each event of two frictions."""
+    n, free, bound = x.closed.shape[0], x.slip == 0, x.hold * x.level
+    own = jnp.sum(x.gains * np.eye(x.rates.shape[0]), 1)[:n]
 
     def compare(force: Array, largest: Array) -> tuple[Array, Array]:
         tie = _tie(force) * (largest + jnp.max(jnp.abs(force)))
-        return jnp.abs(force) - largest > tie, largest - jnp.abs(force) > tie
+        force = jnp.abs(force[n:])
+        return force - largest > tie, largest - force > tie
 
-    def solved(slip: Array, level: Array) -> Array:
-        return forces_in(x._replace(level=level), (), none, slip == 0, slip)
+    def solved(pushes: Array, slip: Array, level: Array) -> Array:
+        return forces_in(x._replace(level=level), (), pushes, slip == 0, slip)
 
-    held = solved(x.slip, x.level)
+    held = solved(x.closed, x.slip, x.level)
     above, below = compare(held, bound)
-    above = free & above
-    slip = jnp.where(above, -jnp.sign(held), x.slip)
+    above, pushes = free & above, x.closed & (held[:n] > 0)
+    slip = jnp.where(above, -jnp.sign(held[n:]), x.slip)
     # The force of the one that begins to slip is first the largest one, then that of a slip.
-    largest, sliding = solved(slip, jnp.where(above, bound, x.level)), solved(slip, x.level)
-    stays = free & ~above
+    largest = solved(pushes, slip, jnp.where(above, bound, x.level))
+    sliding = solved(pushes, slip, x.level)
+    stays, opens = free & ~above, x.closed & ~pushes
     rate = x.gains @ sliding + x.rates
     size = jnp.max(jnp.abs(x.rates)) + jnp.max(jnp.abs(rate - x.rates))
-    goes = rate * slip > 2 * released_share(rate) * size
-    sure = (
-        _are_independent(x.gains)
-        & jnp.all(below | ~stays)
-        & (jnp.sum(jnp.where(above, 1.0, 0.0)) <= 1)
-    )
+    least = 2 * released_share(rate) * size
+    acts = jnp.concatenate([x.closed, free])
+    sure = _are_independent(jnp.where(acts[:, None] & acts, x.gains, np.eye(acts.shape[0])))
+    sure = sure & jnp.all(below | ~stays)
+    sure = sure & (jnp.sum(jnp.where(jnp.concatenate([opens, above]), 1.0, 0.0)) <= 1)
     for force in (largest, sliding):
         sure = sure & jnp.all(compare(force, bound)[1] | ~stays)
-    sure = sure & jnp.all(goes | ~above)
-    found = _Decided(none, stays, slip, sliding, jnp.zeros_like(size))
-    return jax.lax.cond(sure, lambda: found, lambda: _decide_in_turn(x, (), True))
+        sure = sure & jnp.all((own * force[:n] > least) | ~pushes)
+    sure = sure & jnp.all((rate[:n] > least) | ~opens)
+    sure = sure & jnp.all((rate[n:] * slip >= -least) | ~above)  # else it is asked anew
+    found = _Decided(pushes, stays, slip, sliding, jnp.zeros_like(size))
+    return jax.lax.cond(sure, lambda: found, lambda: _decide_in_turn(x, (), bool(len(x.level))))
 
 
 def _are_independent(gains: Array) -> Array:

@@ -10,6 +10,7 @@ from ..._types import Flag, Scalar, Scalars, State
 from ...machine import (
     AbstractEvent,
     AbstractMachine,
+    DryFriction,
     after_event,
     chosen_stop,
     constant_modes,
@@ -650,17 +651,22 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
             modes = select(here, stops_of(machine)[number].modes_after(*given), modes)
     if modes and (is_compound(machine) or (contact and holds_anywhere(machine))):
         # The force that friction has to hold depends on the bodies that rest now.
-        released = None
+        released, asked = None, met
         if contact:
             # What friction leaves of a force may press a body on its stop by rounding only. If the
             # friction held the body instead, nothing would ever release it.
             rests = any_of(met, (x > 0 for x in contact))
             released = {i: rests & (jnp.abs(modes[i]) >= 1) for i in frictions_in(machine)}
-        new = struck_modes(
-            machine, lane.s, lane.state, modes, contact=contact, before=at_event,
-            released=released, jump=jump,
-        )  # fmt: skip
-        modes = select(met, new, modes)
+            if not is_compound(machine):  # otherwise the next step's guards show what begins to slip
+                asked = met & (rests | _slips_change(machine, lane.s, at_event, lane.state))
+
+        def struck(modes: Scalars) -> Scalars:
+            return struck_modes(
+                machine, lane.s, lane.state, modes, contact=contact, before=at_event,
+                released=released, jump=jump,
+            )  # fmt: skip
+
+        modes = jax.lax.cond(asked, struck, lambda modes: modes, modes)
     lane = lane._replace(direction=tuple(direction), modes=modes)
     if lane.contact is None or len(impacts) == 1:
         return lane
@@ -671,6 +677,13 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
         lane = lane.log_event(lifted, clock, EventKind.release, old - to_event(0), jnp.nan)
     # It may release bodies on other stops. A stop may have changed the modes already.
     return release_pulled(plan, lane, step.taken, met, (at_event, before.modes), before.contact)
+
+
+def _slips_change(machine: AbstractMachine, s: Scalar, before: State, after: State) -> Flag:
+    """Return whether an impact changes the slip of a dry friction at all."""
+    dry = [x for x in switches_of(machine) if isinstance(x, DryFriction)]
+    pairs = ([x.speed_of_slip(machine, s, state) for state in (before, after)] for x in dry)
+    return stop_gradient(any_of(jnp.zeros((), bool), (old != new for old, new in pairs)))
 
 
 def _extremes(step: AppliedStep, places: Scalars) -> dict[str, Any]:
