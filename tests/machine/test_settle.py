@@ -10,6 +10,7 @@ from vi_jax.machine.settle import (
     Contacts,
     Strike,
     _decide_in_turn,
+    _decide_one,
     _decide_quickly,
     settle,
     strike,
@@ -159,6 +160,24 @@ def test_contacts_without_friction_settle_as_by_lemkes_method(contacts):
     assert (begins.sum(1) == 1).sum() > 100 and sticks.all(1).sum() > 100  # both happen
     opens = np.stack([x.closed for x in questions]) & ~found.pushes
     assert not contacts or (opens.sum(1) == 1).sum() > 100
+
+
+def test_one_contact_with_friction_settles_as_by_lemkes_method():
+    rng = np.random.default_rng(9)
+    questions = []
+    for _ in range(2400):
+        rows = rng.normal(size=(2, 3))
+        friction = rng.choice([0, 0.5, 3, 10], 1) * rng.uniform()
+        closed, slip = rng.uniform(size=1) < 0.9, rng.choice([-1.0, 0, 0, 1.0], 1)
+        rates = rows @ rng.normal(size=3)
+        questions.append(
+            Contacts(rows @ rows.T, rates, friction, closed, slip, np.zeros(0), np.ones(1))
+        )
+    both = jax.jit(jax.vmap(lambda x: (_decide_one(x), _decide_in_turn(x, (0,), False))))
+    for one, lemke in each(both, questions):
+        assert one.code == lemke.code and one.holds == lemke.holds and one.pushes == lemke.pushes
+        np.testing.assert_allclose(one.force, lemke.force, rtol=1e-9, atol=1e-9)
+        assert one.mode == lemke.mode or not lemke.pushes  # a slip without force is decided later
 
 
 def test_random_impacts_keep_the_conditions():

@@ -321,8 +321,12 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
     x, n = stop_gradient(x), x.closed.shape[0]
     if x.rates.shape == (1,):
         return _settle_one(x)
-    few = not of and len(x.rates) <= _FEW
-    found = _decide_quickly(x) if few else _decide_in_turn(x, of, has_ratios)
+    if of == (0,) and len(x.rates) == 2:
+        found = _decide_one(x)
+    elif not of and len(x.rates) <= _FEW:
+        found = _decide_quickly(x)
+    else:
+        found = _decide_in_turn(x, of, has_ratios)
     pushed = x.gains @ found.force
     rate = pushed + x.rates
     size = jnp.max(jnp.abs(x.rates)) + jnp.max(jnp.abs(pushed))
@@ -443,6 +447,60 @@ def _settle_one(x: Contacts) -> Settled:
     return Settled(force, x.rates + x.gains[0] * force, x.closed, x.closed, mode, none)
 
 
+class _Planar(NamedTuple):
+    """The gains of a contact with one friction: its normal row's and its tangent's own, the rate of
+    the normal by the tangent's force and the reverse, and μ."""
+
+    normal: Array
+    tangent: Array
+    gain: Array
+    back: Array
+    level: Array
+
+    def with_slip(self, sign: Array | float, wanted: Array) -> Array:
+        """Return the push that gives the normal this rate with the friction of a given slip."""
+        return wanted / (self.normal - sign * self.level * self.gain)
+
+    def without_slip(
+        self, wanted: Array, stop: Array, hold: Array | float = 1.0
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return push and friction that give the wanted rates, whether the body sticks, and the
+        direction of its slip otherwise."""
+        det = self.normal * self.tangent - self.gain * self.back
+        det = jnp.where(det == 0, 1.0, det)
+        push = (self.tangent * wanted - self.gain * stop) / det
+        drag = (self.normal * stop - self.back * wanted) / det
+        forward, backward = (self.with_slip(sign, wanted) for sign in (1.0, -1.0))
+        # Whether the body slips forward, with the friction against it. The stop cannot pull: if its
+        # push would be negative so, the body slips backward.
+        goes = (self.back - self.level * self.tangent) * forward - stop > 0
+        is_forward = (forward >= 0) & goes
+        slips = jnp.where(is_forward, forward, backward)
+        sign = jnp.where(is_forward, 1.0, -1.0)
+        stays = jnp.abs(drag) <= hold * self.level * jnp.maximum(push, 0.0)
+        stays = stays & (self.tangent > 0)
+        pushes = jnp.where(stays, push, slips)
+        return pushes, jnp.where(stays, drag, -sign * self.level * slips), stays, sign
+
+
+def _decide_one(x: Contacts) -> _Decided:
+    """Return `_decide` of a single contact with friction, in closed form."""
+    (normal, gain), (back, tangent) = x.gains
+    planar = _Planar(normal, tangent, gain, back, x.friction[0])
+    (wanted, stop), given, hold = -x.rates, x.slip[0], x.hold[0]
+    slides, presses = given != 0, x.closed[0] & (wanted > 0)
+    push, drag, stays, sign = planar.without_slip(wanted, stop, hold)
+    pushed = planar.with_slip(given, wanted)
+    push = jnp.where(slides, pushed, push)
+    drag = jnp.where(slides, -given * planar.level * pushed, drag)
+    unsolved = presses & ~((push >= 0) & (push < jnp.inf))
+    presses = presses & ~unsolved
+    force, holds = jnp.where(presses, jnp.stack([push, drag]), 0.0), presses & stays & ~slides
+    mode = jnp.where(slides | ~presses | holds, given, sign)
+    code = jnp.where(unsolved, UNSOLVED, jnp.zeros_like(push))
+    return _Decided(presses[None], holds[None], mode[None], force, code)
+
+
 class Blow(NamedTuple):
     """The result of impacts on several contacts at once."""
 
@@ -515,31 +573,17 @@ def _strike_one(x: Strike, of: tuple[int, ...]) -> Blow:
         impulse = here * (-(1 + restitution) * speed / normal)
         return Blow(impulse, jnp.ones_like(speed), code != SOLVED)
     along = here[np.asarray(of)]
-    level = jnp.sum(along * x.friction)
     slip, kept = (jnp.sum(along * y) for y in (x.velocity[n:], x.tangential))
     gain, both = jnp.sum(along * across[n:]), jnp.sum(along[:, None] * x.gains[n:], 0)
     back, tangent = jnp.sum(here * both[:n]), jnp.sum(along * both[n:])
+    planar = _Planar(normal, tangent, gain, back, jnp.sum(along * x.friction))
 
-    def impulses(e: Array, et: Array) -> tuple[Array, Array]:
-        wanted, stop = -(1 + e) * speed, -(1 + et) * slip
-        det = normal * tangent - gain * back
-        det = jnp.where(det == 0, 1.0, det)
-        sticks = (tangent * wanted - gain * stop) / det, (normal * stop - back * wanted) / det
-        forward, backward = (wanted / (normal - sign * level * gain) for sign in (1.0, -1.0))
-        # Whether the body slips forward after the impact, with the friction against it. The stop
-        # cannot pull: if its push would be negative so, the body slips backward.
-        is_forward = (forward >= 0) & ((back - level * tangent) * forward - stop > 0)
-        push = jnp.where(is_forward, forward, backward)
-        drag = jnp.where(is_forward, -level, level) * push
-        stays = jnp.abs(sticks[1]) <= level * jnp.maximum(sticks[0], 0.0)
-        stays = stays & (jnp.sum(along) > 0)
-        return jnp.where(stays, sticks[0], push), jnp.where(stays, sticks[1], drag)
+    def impulses(share: float) -> Array:
+        wanted = -(1 + share * restitution) * speed, -(1 + share * kept) * slip
+        push, drag, _, _ = planar.without_slip(*wanted)
+        return zeros.at[:n].set(here * push).at[n:].set(along * drag)
 
-    def in_rows(pair: tuple[Array, Array]) -> Array:
-        return zeros.at[:n].set(here * pair[0]).at[n:].set(along * pair[1])
-
-    inelastic, full = (in_rows(impulses(f * restitution, f * kept)) for f in (0.0, 1.0))
-    return _without_gain(x, inelastic, full, code)
+    return _without_gain(x, impulses(0.0), impulses(1.0), code)
 
 
 def _without_gain(x: Strike, inelastic: Array, full: Array, code: Array) -> Blow:

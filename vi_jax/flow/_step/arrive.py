@@ -657,7 +657,7 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
             # friction held the body instead, nothing would ever release it.
             rests = any_of(met, (x > 0 for x in contact))
             released = {i: rests & (jnp.abs(modes[i]) >= 1) for i in frictions_in(machine)}
-            if not is_compound(machine):  # otherwise the next step's guards show what begins to slip
+            if not is_compound(machine):  # else the next guards show what begins to slip
                 asked = met & (rests | _slips_change(machine, lane.s, at_event, lane.state))
 
         def struck(modes: Scalars) -> Scalars:
