@@ -164,7 +164,8 @@ def test_orbits_sweeps_scans_and_basins_agree_with_runs_of_scalars():
         last = np.reshape(getattr(runs.sections, theirs)[:, -2:], (2, 2, 2))
         np.testing.assert_allclose(scan[ours], last, rtol=0, atol=1e-11)
     sweep = vi.sweep(MACHINE, "gap", [0.6], settle=200, cycles=4)
-    np.testing.assert_allclose(sweep.y_min[0], orbit.y_min, rtol=0, atol=1e-11)
+    # The search ends at a residual of 2e-11 here.
+    np.testing.assert_allclose(sweep.y_min[0], orbit.y_min, rtol=0, atol=3e-11)
     basins = vi.basins(MACHINE, {"start.q[1]": (-0.5, 0.5)}, resolution=4, longest=8)
     (basin,) = basins.attractors
     assert (basin.starts, basin.period) == (4, 1)

@@ -87,10 +87,12 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
             plan = dataclasses.replace(plan, first_modes=modes)
         else:
             plan = with_sizes(plan, s, start, modes)
+    rows = plan.recorded_intervals + 1
+    plan = dataclasses.replace(plan, cycles=jnp.asarray(plan.cycles, zero.dtype))
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(
         partial(_begin, rest), partial(_step, rest), partial(_end, rest),
-        (numbers, start, jnp.asarray(wanted)), rows=plan.recorded_intervals + 1,
+        (numbers, start, jnp.asarray(wanted)), rows=rows,
         backend=plan.backend,
     )  # fmt: skip
     if not is_unchanged:

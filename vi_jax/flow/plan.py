@@ -67,8 +67,8 @@ class Plan(eqx.Module):
 
     machine: AbstractMachine
     method: AbstractMethod
-    cycles: int = eqx.field(static=True)
-    """Cycles to record."""
+    cycles: Any
+    """Cycles to record: an integer outside of the loop, a number within."""
     parts: int = eqx.field(static=True)
     """Record points per cycle."""
     records_motion: bool = eqx.field(static=True)
@@ -153,7 +153,7 @@ class Plan(eqx.Module):
         return beyond
 
     @property
-    def recorded_intervals(self) -> int:
+    def recorded_intervals(self) -> Any:
         """The number of intervals that are recorded, without those of `settle`."""
         return self.cycles * self.parts
 

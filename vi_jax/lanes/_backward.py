@@ -31,6 +31,7 @@ from ._reverse import ReverseProgram, reverse
 
 def by_columns(
     program: LaneProgram,
+    rows: int,
     backend: str,
     args: Sequence[Any],
     weights: Mapping[int, Any],
@@ -52,7 +53,7 @@ def by_columns(
     size = min(number, DIRECTIONS)
     units = jnp.eye(-(-number // size) * size, number)  # padded, so that one program serves all
     run_many = jax.vmap(
-        functools.partial(lanes_p.bind, program=program, backend=backend),
+        functools.partial(lanes_p.bind, program=program, rows=rows, backend=backend),
         [0 if i in places else None for i in range(len(args))],
         axis_size=size,
     )
@@ -103,7 +104,7 @@ lanes_backward_p = primitive_of_programs("lanes_backward")
 # --- the transpose of `lanes`
 
 
-def _transposed(cotangents, *args, program: LaneProgram, backend: str):
+def _transposed(cotangents, *args, program: LaneProgram, rows: int, backend: str):
     """Transpose a program: by a tape for many numbers, if possible, else by columns."""
     linear = [ad.is_undefined_primal(x) for x in args]
     shapes = [x.aval.shape if u else jnp.shape(x) for x, u in zip(args, linear, strict=True)]
@@ -112,10 +113,10 @@ def _transposed(cotangents, *args, program: LaneProgram, backend: str):
     number = sum(a.size for a, u in zip(program.in_avals, linear, strict=True) if u)
     found = None
     if backend != "xla" and number > _most_columns(program):
-        found = _by_tape(program, args, linear, weights)
+        found = _by_tape(program, rows, args, linear, weights)
     if found is None:
         inputs = [None if u else jnp.asarray(x) for x, u in zip(args, linear, strict=True)]
-        found = by_columns(program, backend, inputs, weights, batch)
+        found = by_columns(program, rows, backend, inputs, weights, batch)
     out: list[Any] = [None] * len(args)
     for i, x in found.items():
         out[i] = _for_argument(x, program.in_avals[i], args[i].aval)
@@ -138,7 +139,9 @@ def _for_argument(x, lane_aval, aval):
     return x.reshape(aval.shape).astype(aval.dtype)
 
 
-def _by_tape(program: LaneProgram, args, linear: list[bool], weights) -> dict[int, Any] | None:
+def _by_tape(
+    program: LaneProgram, rows: int, args, linear: list[bool], weights
+) -> dict[int, Any] | None:
     """Return cotangents by the places of their tangents, which are flagged in `linear`. Return
     `None` if it is no program of values and derivatives, or if a part of it has no transpose."""
     base = program.base
@@ -149,13 +152,13 @@ def _by_tape(program: LaneProgram, args, linear: list[bool], weights) -> dict[in
     slopes = forward(base, program.varied).slopes
     if set(weights) - set(slopes.values()):
         return None
-    given = tuple(slopes.get(k, -1) in weights for k in range(len(base.result_avals)))
+    given = tuple(slopes.get(k, -1) in weights for k in range(base.result_count))
     back = reverse(base, wanted, given)
     if back is None:
         return None
     inputs = [jnp.asarray(x) for x in args[: len(base.in_avals)]]
     cotangents = [weights[slopes[k]] for k, flag in enumerate(given) if flag]
-    found = lanes_backward_p.bind(*inputs, *cotangents, program=back)
+    found = lanes_backward_p.bind(*inputs, *cotangents, program=back, rows=rows)
     targets = [places[i] for i, flag in enumerate(wanted) if flag]
     return dict(zip(targets, found, strict=True))
 
@@ -173,7 +176,7 @@ ad.primitive_transposes[lanes_p] = _transposed
 # --- `lanes_backward`
 
 
-def _columns(*args, program: ReverseProgram) -> list[Any]:
+def _columns(*args, program: ReverseProgram, rows: int) -> list[Any]:
     base, varied = program.program, program.varied
     n, batch = len(base.in_avals), batch_of(program, [x.shape for x in args])
     inputs, weights_given = list(args[:n]), args[n:]
@@ -183,28 +186,28 @@ def _columns(*args, program: ReverseProgram) -> list[Any]:
     cotangents = iter(weights_given)
     weights = {slopes[k]: next(cotangents) for k, flag in enumerate(program.given) if flag}
     tangents = [None for flag in varied if flag]
-    found = by_columns(derived.program, "auto", [*inputs, *tangents], weights, batch)
+    found = by_columns(derived.program, rows, "auto", [*inputs, *tangents], weights, batch)
     return [found[n + k] for k in range(len(tangents))]
 
 
-def _batched(args, dims, *, program: ReverseProgram):
+def _batched(args, dims, *, program: ReverseProgram, rows: int):
     """Make an axis of `jax.vmap` one of lanes. But many cotangents of the same motions, as in
     `jax.jacrev`, go by columns, which share the motions."""
     args = [jnp.asarray(x) for x in args]
     n, (size, inner) = len(program.program.in_avals), axes_of(program, args, dims)
-    number = sum(a.size for a in program.result_avals)
+    number = sum(a.size for a in program.results())
     same_motions = all(d is None for d in dims[:n])
     if same_motions and size * _COLUMNS_EACH > number:
-        columns = jax.vmap(functools.partial(_columns, program=program), dims)
-        return columns(*args), [0] * len(program.result_avals)
+        columns = jax.vmap(functools.partial(_columns, program=program, rows=rows), dims)
+        return columns(*args), [0] * len(program.results())
     moved = with_lane_axis(args, dims, program.in_avals, inner, size)
-    out = lanes_backward_p.bind(*moved, program=program)
+    out = lanes_backward_p.bind(*moved, program=program, rows=rows)
     return out, [0] * len(out)
 
 
-def _jvp(primals, tangents, *, program: ReverseProgram):
+def _jvp(primals, tangents, *, program: ReverseProgram, rows: int):
     """Return Jᵀc and its derivative (see the module's docstring)."""
-    values = lanes_backward_p.bind(*primals, program=program)
+    values = lanes_backward_p.bind(*primals, program=program, rows=rows)
     base, n = program.program, len(program.program.in_avals)
     moved = tuple(type(x) is not ad.Zero for x in tangents[:n])
     changed = [None if type(x) is ad.Zero else x for x in tangents[n:]]
@@ -219,15 +222,15 @@ def _jvp(primals, tangents, *, program: ReverseProgram):
     else:
         derived, weights = base, dc
     wanted = (*program.varied, *(False for _ in inputs[n:]))
-    given = tuple(k in weights for k in range(len(derived.result_avals)))
+    given = tuple(k in weights for k in range(derived.result_count))
     if not weights:
         return values, [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in values]
     back = reverse(derived, wanted, given)
     if back is None:
-        columns = functools.partial(_columns, program=program)
+        columns = functools.partial(_columns, program=program, rows=rows)
         return values, jax.jvp(columns, primals, [*map(ad.instantiate_zeros, tangents)])[1]
     ordered = [weights[k] for k in sorted(weights)]
-    return values, lanes_backward_p.bind(*inputs, *ordered, program=back)
+    return values, lanes_backward_p.bind(*inputs, *ordered, program=back, rows=rows)
 
 
 def _by_result(program: ReverseProgram, cotangents: Sequence[Any]) -> dict[int, Any]:
@@ -251,9 +254,9 @@ ad.primitive_jvps[lanes_backward_p] = _jvp
 _columns_lowered = mlir.lower_fun(_columns, multiple_results=True)
 
 
-def _lowered(ctx, *args, program: ReverseProgram):
-    otherwise = functools.partial(_columns_lowered, ctx, *args, program=program)
-    return lower_to_kernel(ctx, args, program, otherwise)
+def _lowered(ctx, *args, program: ReverseProgram, rows: int):
+    otherwise = functools.partial(_columns_lowered, ctx, *args, program=program, rows=rows)
+    return lower_to_kernel(ctx, args, program, rows, otherwise)
 
 
 mlir.register_lowering(lanes_backward_p, _lowered, platform="cpu")

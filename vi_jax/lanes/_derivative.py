@@ -91,7 +91,6 @@ def forward(program: LaneProgram, varied: tuple[bool, ...]) -> Derived:
     )
     derived = LaneProgram(
         parts=parts,
-        rows=program.rows,
         tangents=(*before, *(True for m in varied if m)),
         varied=varied,
         base=program,

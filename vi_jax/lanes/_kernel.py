@@ -1,9 +1,10 @@
 """The text of a kernel: a machine function that runs one lane after another in each slot.
 
-    void kernel(ptr inputs, ptr strides, ptr outputs, i64 lanes, ptr next, ptr stop)
+    void kernel(ptr inputs, ptr sizes, ptr outputs, i64 lanes, ptr next, ptr stop)
 
-`inputs` and `outputs` are tables of pointers to arrays, one per leaf. A stride of 0 shares an input
-between all lanes. `next` counts the lanes that all threads have taken; `stop` ends the call early.
+`inputs` and `outputs` are tables of pointers to arrays, one per leaf. `sizes` are the greatest
+number of rows and the inputs' strides; one of 0 shares an input between all lanes. `next` counts
+the lanes that all threads have taken; `stop` ends the call early.
 
 The method of the same name writes each block (`docs/internals/lanes.md` has the picture):
 
@@ -52,7 +53,7 @@ _MOST_BYTES = 4 << 30
 _LINE = 64
 
 _PREAMBLE = """\
-define void @kernel(ptr noalias readonly %inputs, ptr noalias readonly %strides,
+define void @kernel(ptr noalias readonly %inputs, ptr noalias readonly %sizes,
                     ptr noalias readonly %outputs, i64 %lanes, ptr %next, ptr %stop) #0 {
 entry:"""
 
@@ -122,6 +123,7 @@ class _Writer:
         self.strides = [load_stride(t, i) for i in range(len(program.in_avals))]
         outs = [load_pointer(t, "outputs", i) for i in range(results + len(program.row_avals))]
         self.results, self.rows = outs[:results], outs[results:]
+        self.most_rows = load_row_count(t)
         self.large: list[Strided | None] = []
         for i, aval in enumerate((*program.in_avals, *program.carry_avals)):
             found = None
@@ -291,16 +293,16 @@ class _Writer:
 
     def _store_row(self, lane: Value, mask: Value, place: Value, row: list[Any]) -> None:
         """Store row number `place` where `mask` holds and the lane has room for it."""
-        t, rows = self.t, self.program.rows
+        t = self.t
         if not row:
             return
-        fits = t.both(mask, t.binary("icmp slt", place, t.constant(rows, "i64"), "i1"))
+        fits = t.both(mask, t.binary("icmp slt", place, self.most_rows, "i1"))
         with t.skipped_unless(fits, rare=True):
             self._put_row(lane, fits, place, row)
 
     def _put_row(self, lane: Value, mask: Value, place: Value, row: list[Any]) -> None:
         t = self.t
-        line = t.binary("add", t.binary("mul", lane, t.constant(self.program.rows, "i64")), place)
+        line = t.binary("add", t.binary("mul", lane, self.most_rows), place)
         for pointer, x in zip(self.rows, row, strict=True):
             scatter(t, pointer, t.binary("mul", line, t.constant(x.size, "i64")), x, mask)
 
@@ -315,7 +317,7 @@ class _Writer:
             nothing = t.constant(float("nan") if is_float(kind) else 0, kind)
             empty.append(to_registers(t, uniform(aval.shape, nothing)))
         over_rows(
-            t, filled, program.rows, ended, lambda n, mask: self._put_row(lane, mask, n, empty)
+            t, filled, self.most_rows, ended, lambda n, mask: self._put_row(lane, mask, n, empty)
         )
 
 
@@ -329,8 +331,13 @@ def load_pointer(t: Text, table: str, i: int) -> str:
 
 def load_stride(t: Text, i: int) -> Value:
     """Return the numbers per lane of input `i` (0 for a shared one), as a vector over the lanes."""
-    place = t.raw(f"getelementptr i64, ptr %strides, i64 {i}")
+    place = t.raw(f"getelementptr i64, ptr %sizes, i64 {i + 1}")
     return splat(t, t.raw(f"load i64, ptr {place}"), "i64")
+
+
+def load_row_count(t: Text) -> Value:
+    """Return the greatest number of rows, as a vector over the lanes."""
+    return splat(t, t.raw("load i64, ptr %sizes"), "i64")
 
 
 def gathered_array(t: Text, pointer: str, base: Value, aval: Any, mask: Value) -> Formula:
@@ -363,7 +370,7 @@ def scatter(t: Text, pointer: str, base: Value, x: Array, mask: Value) -> None:
 
 
 def over_rows(
-    t: Text, first: Value, number: int, mask: Value, body: Callable[[Value, Value], None]
+    t: Text, first: Value, number: Value, mask: Value, body: Callable[[Value, Value], None]
 ) -> None:
     """Write a loop over the rows of each lane, beginning at that lane's first row. `body` gets each
     slot's row and the mask of slots that have it."""
@@ -371,7 +378,7 @@ def over_rows(
     t.line(f"br label %{head}")
     t.open(head)
     at, place, following = len(t.lines), Value(t.fresh(), "i64"), Value(t.fresh(), "i64")
-    has_row = t.both(mask, t.binary("icmp slt", place, t.constant(number, "i64"), "i1"))
+    has_row = t.both(mask, t.binary("icmp slt", place, number, "i1"))
     t.fork(t.any(has_row), inside, after)
     t.open(inside)
     body(place, has_row)

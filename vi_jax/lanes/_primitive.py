@@ -41,9 +41,9 @@ def primitive_of_programs(name: str) -> Primitive:
     primitive.multiple_results = True
 
     @primitive.def_abstract_eval
-    def _(*args, program: AnyProgram, **others):
+    def _(*args, program: AnyProgram, rows: int, **others):
         batch = batch_of(program, [a.shape for a in args])
-        return [ShapedArray((*batch, *a.shape), a.dtype) for a in program.result_avals]
+        return [ShapedArray((*batch, *a.shape), a.dtype) for a in program.results(rows)]
 
     run_outside_jit(primitive)
     return primitive
@@ -56,16 +56,16 @@ lanes_p = primitive_of_programs("lanes")
 DIRECTIONS = 8
 
 
-def _batched(args, dims, *, program: LaneProgram, backend: str):
+def _batched(args, dims, *, program: LaneProgram, rows: int, backend: str):
     """Make an axis of `jax.vmap` one of lanes, or of directions within a lane: the latter if only
     tangents have the axis and its length is at most `DIRECTIONS`."""
     args = [jnp.asarray(x) for x in args]
     (size, inner), batched = axes_of(program, args, dims), tuple(d is not None for d in dims)
     tangents = program.tangents or (False,) * len(batched)
     if all(t or not m for t, m in zip(tangents, batched, strict=True)) and 1 < size <= DIRECTIONS:
-        return _batched_directions(args, dims, inner, batched, size, program, backend)
+        return _batched_directions(args, dims, inner, batched, size, program, rows, backend)
     moved = with_lane_axis(args, dims, program.in_avals, inner, size)
-    out = lanes_p.bind(*moved, program=program, backend=backend)
+    out = lanes_p.bind(*moved, program=program, rows=rows, backend=backend)
     depend = dependent_parts(program, batched, smooth=False)
     wide = [depend.control or w for w in (*depend.outs, *depend.rows)]
     # Results that are equal in all lanes get no axis, as in `vmap` itself.
@@ -85,7 +85,7 @@ def axes_of(program: AnyProgram, args, dims) -> tuple[int, tuple[int, ...]]:
 
 def with_lane_axis(args, dims, avals, inner: tuple, size: int) -> list[Any]:
     """Return arguments of a batch of lanes, with an axis of `jax.vmap`, at `dims`, before the other
-    batch axes `inner`; `avals` are of one lane."""
+    batch axes `inner`; `avals` have the numbers of axes in one lane."""
     moved = []
     for x, d, aval in zip(args, dims, avals, strict=True):
         is_single = x.ndim - (d is not None) == aval.ndim
@@ -93,14 +93,15 @@ def with_lane_axis(args, dims, avals, inner: tuple, size: int) -> list[Any]:
             moved.append(x)  # shared by all lanes
             continue
         x = x[None] if d is None else jnp.moveaxis(x, d, 0)
+        shape = x.shape[x.ndim - aval.ndim :]
         if is_single:
-            x = x.reshape(x.shape[0], *(1 for _ in inner), *aval.shape)
-        moved.append(jnp.broadcast_to(x, (size, *inner, *aval.shape)))
+            x = x.reshape(x.shape[0], *(1 for _ in inner), *shape)
+        moved.append(jnp.broadcast_to(x, (size, *inner, *shape)))
     return moved
 
 
 def _batched_directions(
-    args, dims, inner: tuple, many, size: int, program: LaneProgram, backend: str
+    args, dims, inner: tuple, many, size: int, program: LaneProgram, rows: int, backend: str
 ):
     """Carry tangents in several directions along with one motion (`widened`)."""
     wide, depend = widened(program, many, size)
@@ -109,7 +110,7 @@ def _batched_directions(
         # After the batch axes, before the axes of one lane's array.
         place = 0 if d is None or x.ndim - 1 == aval.ndim else axes
         moved.append(x if d is None else jnp.moveaxis(x, d, place))
-    out = lanes_p.bind(*moved, program=wide, backend=backend)
+    out = lanes_p.bind(*moved, program=wide, rows=rows, backend=backend)
     places = [axes if w else None for w in depend.outs]
     places += [axes + 1 if w else None for w in depend.rows]
     return out, places
@@ -118,11 +119,11 @@ def _batched_directions(
 batching.primitive_batchers[lanes_p] = _batched
 
 
-def _jvp(primals, tangents, *, program: LaneProgram, backend: str):
+def _jvp(primals, tangents, *, program: LaneProgram, rows: int, backend: str):
     varied = tuple(type(t) is not ad.Zero for t in tangents)
     derived = forward(program, varied)
     changes = [t for t in tangents if type(t) is not ad.Zero]
-    out = lanes_p.bind(*primals, *changes, program=derived.program, backend=backend)
+    out = lanes_p.bind(*primals, *changes, program=derived.program, rows=rows, backend=backend)
     values = [out[place] for place in derived.values]
     return values, [
         out[derived.slopes[k]] if flag else ad.Zero(jax.typeof(values[k]).to_tangent_aval())
@@ -130,21 +131,20 @@ def _jvp(primals, tangents, *, program: LaneProgram, backend: str):
     ]
 
 
-def _partially_known(trace, *tracers, program: LaneProgram, backend: str):
+def _partially_known(trace, *tracers, program: LaneProgram, rows: int, backend: str):
     """Evaluate partially for `jax.linearize` and `jax.grad`, where tangents are unknown: the
     program of the values runs at once, that of values and derivatives is postponed. The tracers are
     those of `JaxprTrace` in JAX's `interpreters/partial_eval.py` (0.10.2).
     `tests/lanes/test_jax.py` fails if they change."""
     unknown = [not t.is_known() for t in tracers]
     of_values = program.values_without(unknown, [t.aval.shape for t in tracers])
-    postponed = trace.default_process_primitive(
-        lanes_p, tracers, {"program": program, "backend": backend}
-    )
+    others = {"rows": rows, "backend": backend}
+    postponed = trace.default_process_primitive(lanes_p, tracers, {"program": program, **others})
     if of_values is None or not any(unknown):
         return postponed
     smaller, is_value = of_values
     given = [t.pval.get_known() for t in tracers[: len(smaller.in_avals)]]
-    values = iter(lanes_p.bind(*given, program=smaller, backend=backend))
+    values = iter(lanes_p.bind(*given, program=smaller, **others))
     return [next(values) if known else x for known, x in zip(is_value, postponed, strict=True)]
 
 
@@ -194,13 +194,13 @@ partial_eval.partial_eval_jaxpr_custom_rules[lanes_p] = _partially_known_equatio
 _STEPS_PER_CHECK = 8
 
 
-def run_on_xla(program: LaneProgram, *args: Any) -> list[Any]:
+def run_on_xla(program: LaneProgram, rows: int, *args: Any) -> list[Any]:
     """Return the results and rows of a batch of lanes, as the primitive does. Inputs have the batch
     axes first, or none if all lanes share them."""
     batch = batch_of(program, [x.shape for x in args])
     lanes = math.prod(batch)
     if lanes == 0:
-        return [jnp.zeros((*batch, *a.shape), a.dtype) for a in program.result_avals]
+        return [jnp.zeros((*batch, *a.shape), a.dtype) for a in program.results(rows)]
     axes = [
         None if batch and x.ndim == a.ndim else 0
         for x, a in zip(args, program.in_avals, strict=True)
@@ -209,12 +209,12 @@ def run_on_xla(program: LaneProgram, *args: Any) -> list[Any]:
         x if axis is None else x.reshape(lanes, *a.shape)
         for x, a, axis in zip(args, program.in_avals, axes, strict=True)
     ]
-    out = _run_together(program, flat, axes, lanes)
+    out = _run_together(program, rows, flat, axes, lanes)
     return [x.reshape(*batch, *x.shape[1:]) for x in out]
 
 
 def _run_together(
-    program: LaneProgram, inputs: list, axes: list[int | None], lanes: int
+    program: LaneProgram, most_rows: int, inputs: list, axes: list[int | None], lanes: int
 ) -> list[Any]:
     """Return results and rows of lanes; `axes` is 0 for an input with a leading axis of lanes."""
     n, index = len(program.carry_avals), jnp.arange(lanes)
@@ -227,7 +227,7 @@ def _run_together(
         # A lane without a new row writes beyond the end, which is dropped. So no two lanes write to
         # one place, and `rows` is not copied. `lax.cond` copied it at each step, which took two
         # thirds of the time on a GPU (JAX 0.11.2).
-        place = jnp.where(complete, filled, program.rows)
+        place = jnp.where(complete, filled, most_rows)
         options = {"mode": "drop", "unique_indices": True, "indices_are_sorted": True}
         return [r.at[index, place].set(x, **options) for r, x in zip(rows, row, strict=True)]
 
@@ -243,7 +243,7 @@ def _run_together(
 
     rows = [
         jnp.full((lanes, *a.shape), jnp.nan if jnp.issubdtype(a.dtype, jnp.inexact) else 0, a.dtype)
-        for a in program.result_avals[len(program.out_avals) :]
+        for a in program.results(most_rows)[len(program.out_avals) :]
     ]
     filled = jnp.zeros(lanes, jnp.int32)
     out = begin(*inputs)
@@ -261,22 +261,22 @@ def _run_together(
 
 
 _on_xla = mlir.lower_fun(
-    lambda *args, program, backend: run_on_xla(program, *args), multiple_results=True
+    lambda *args, program, rows, backend: run_on_xla(program, rows, *args), multiple_results=True
 )
 
 
-def _lowered(ctx, *args, program: LaneProgram, backend: str):
+def _lowered(ctx, *args, program: LaneProgram, rows: int, backend: str):
     """Lower to a call of the program's kernel on a CPU, else to XLA's loop."""
-    otherwise = functools.partial(_on_xla, ctx, *args, program=program, backend=backend)
+    otherwise = functools.partial(_on_xla, ctx, *args, program=program, rows=rows, backend=backend)
     if backend == "xla":
         if _vector_only.get():
             raise Unsupported("the other backend")
         return otherwise()
-    return lower_to_kernel(ctx, args, program, otherwise)
+    return lower_to_kernel(ctx, args, program, rows, otherwise)
 
 
 @without_collection()
-def lower_to_kernel(ctx, args, program: AnyProgram, otherwise: Callable[[], Any]):
+def lower_to_kernel(ctx, args, program: AnyProgram, rows: int, otherwise: Callable[[], Any]):
     """Lower to a call of a program's kernel. Without a kernel, warn and return `otherwise()`;
     within `vector_only` raise `Unsupported` instead."""
     try:
@@ -290,16 +290,16 @@ def lower_to_kernel(ctx, args, program: AnyProgram, otherwise: Callable[[], Any]
         _warn(str(reason))
         return otherwise()
     ctx.module_context.add_keepalive(kernel)  # kept as long as the compiled program
-    call = functools.partial(kernel_call, target, kernel, program, ctx.avals_out)
+    call = functools.partial(kernel_call, target, kernel, program, rows, ctx.avals_out)
     return mlir.lower_fun(call, multiple_results=True)(ctx, *args)
 
 
-def kernel_call(target: str, kernel, program: AnyProgram, avals, *args):
+def kernel_call(target: str, kernel, program: AnyProgram, rows: int, avals, *args):
     strides = [
-        aval.size if x.ndim > aval.ndim else 0
+        math.prod(x.shape[x.ndim - aval.ndim :]) if x.ndim > aval.ndim else 0
         for x, aval in zip(args, program.in_avals, strict=True)
     ]
-    head = header(kernel.key, _lane_count(program, args), strides)
+    head = header(kernel.key, _lane_count(program, args), rows, strides)
     return jax.ffi.ffi_call(target, [*map(shape_of, avals)])(head, *args)
 
 

@@ -41,14 +41,12 @@ class LaneProgram(eqx.Module):
     """The loop of a lane as jaxprs of flat arguments; hashable, as a primitive's parameter must be.
 
     `begin(inputs)` and `step(inputs, carry)` return the carry, whether the lane continues, whether
-    a row is complete, and the row. `end(inputs, carry)` returns the results. `rows` is the greatest
-    number of rows of a lane. Shapes are those of one lane, without batch axes.
+    a row is complete, and the row. `end(inputs, carry)` returns the results. Shapes are those of
+    one lane, without batch axes. The greatest number of rows is an argument of each call.
     """
 
     parts: tuple[Part, Part, Part] = eqx.field(static=True)
     """The functions `begin`, `step` and `end`, each traced when its jaxpr is asked for."""
-    rows: int = eqx.field(static=True)
-
     tangents: tuple[bool, ...] = eqx.field(static=True, default=())
     """Flags of the inputs that are tangents. The number of iterations must not depend on them."""
 
@@ -98,11 +96,15 @@ class LaneProgram(eqx.Module):
     def row_avals(self) -> list[Any]:
         return self.parts[0].out_avals[len(self.carry_avals) + 2 :]
 
+    def results(self, rows: int) -> list[Any]:
+        """Return shapes and types of one lane's results, then of its rows, stacked."""
+        stacked = [jax.ShapeDtypeStruct((rows, *a.shape), a.dtype) for a in self.row_avals]
+        return [*self.out_avals, *stacked]
+
     @property
-    def result_avals(self) -> list[Any]:
-        """Shapes and types of one lane's results, then of its rows, stacked."""
-        rows = [jax.ShapeDtypeStruct((self.rows, *a.shape), a.dtype) for a in self.row_avals]
-        return [*self.out_avals, *rows]
+    def result_count(self) -> int:
+        """The number of arrays of results and rows."""
+        return len(self.out_avals) + len(self.row_avals)
 
     def values_without(
         self, missing: Sequence[bool], shapes: Sequence[tuple[int, ...]]
@@ -110,7 +112,7 @@ class LaneProgram(eqx.Module):
         """Return the program of the values that can be computed without the `missing` tangents, and
         flags of the results and rows that it returns; `None` if no such program exists. `shapes` of
         the inputs include batch axes."""
-        found, base = [True] * len(self.result_avals), self.base
+        found, base = [True] * self.result_count, self.base
         program, batch = self, batch_of(self, shapes)
         while base is not None and any(missing[: len(program.in_avals)]):
             outs, rows = len(base.out_avals), len(base.row_avals)

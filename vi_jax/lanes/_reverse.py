@@ -155,13 +155,13 @@ class ReverseProgram(eqx.Module):
 
     @property
     def in_avals(self) -> list[Any]:
-        """Shapes and types of one lane's inputs, including the cotangents of all its rows."""
-        weights = zip(self.program.result_avals, self.given, strict=True)
+        """Shapes and types of one lane's inputs, including the cotangents of its rows: here none,
+        since their number belongs to a call."""
+        weights = zip(self.program.results(0), self.given, strict=True)
         return [*self.program.in_avals, *(a for a, flag in weights if flag)]
 
-    @property
-    def result_avals(self) -> list[Any]:
-        """Shapes and types of the wanted cotangents of one lane."""
+    def results(self, rows: int = 0) -> list[Any]:
+        """Return shapes and types of the wanted cotangents of one lane."""
         return [a for a, v in zip(self.program.in_avals, self.varied, strict=True) if v]
 
 

@@ -38,7 +38,15 @@ from ._arrays import (
     to_registers,
     uniform,
 )
-from ._kernel import gathered_array, load_pointer, load_stride, over_rows, scatter, shared_input
+from ._kernel import (
+    gathered_array,
+    load_pointer,
+    load_row_count,
+    load_stride,
+    over_rows,
+    scatter,
+    shared_input,
+)
 from ._operations import add, compare, kind_of
 from ._reverse import ReverseProgram
 from ._text import RARE, FixedText, Text, Value, attributes
@@ -70,7 +78,7 @@ define internal ptr @aligned(ptr %memory) {{
   ret ptr %place
 }}
 
-define void @kernel(ptr %inputs, ptr %strides, ptr %outputs, i64 %lanes, ptr %next, ptr %stop) #0 {{
+define void @kernel(ptr %inputs, ptr %sizes, ptr %outputs, i64 %lanes, ptr %next, ptr %stop) #0 {{
 entry:
   %memory = call ptr @malloc(i64 {frame})
   %first.size = mul i64 {entry}, {entries}
@@ -193,7 +201,7 @@ def reverse_text(
 # Types: of a lane's number and of its counters; of a boolean.
 _LANE, _FLAG = np.zeros((), np.int64), np.zeros((), bool)
 
-_ARGUMENTS = "ptr %inputs, ptr %strides, ptr %outputs, ptr %frame"
+_ARGUMENTS = "ptr %inputs, ptr %sizes, ptr %outputs, ptr %frame"
 
 
 class _Writer:
@@ -210,7 +218,7 @@ class _Writer:
             for flag, a in zip(one_for_all or (False,) * n, self.inputs, strict=False)
         ]
         self.results = sum(program.given[: len(self.base.out_avals)])
-        self.varied = program.result_avals
+        self.varied = program.results()
         self.carried = [
             a for a, flag in zip(program.carry_avals, program.carried, strict=True) if flag
         ]
@@ -282,7 +290,7 @@ class _Writer:
         no_weights = zeros(t, avals)
         if not avals:
             return no_weights
-        has_row = t.binary("icmp slt", place, t.constant(self.base.rows, "i64"), "i1")
+        has_row = t.binary("icmp slt", place, load_row_count(t), "i1")
         mask = t.both(complete, has_row)
 
         def read() -> list[Array]:
@@ -322,7 +330,7 @@ class _Writer:
             is_nonzero = lambda x: compare(t, "ne", x, t.zero(x.kind), False)
             self._undefine(t, [mapped(t, is_nonzero, x, kind="i1") for x in read])
 
-        over_rows(t, rows, self.base.rows, present, mark_lanes)
+        over_rows(t, rows, load_row_count(t), present, mark_lanes)
 
     def _back(
         self, t: Text, jaxpr: ClosedJaxpr, args: list[Array], mask: Value

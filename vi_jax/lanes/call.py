@@ -187,9 +187,9 @@ def _run_kernel(frame: _Frame) -> int | None:
     arguments, results = frame.arguments, frame.results
     head = arguments.items[0].contents
     numbers = np.ctypeslib.as_array(
-        ctypes.cast(head.data, POINTER(c_int32)), (2 * (arguments.size + 1),)
+        ctypes.cast(head.data, POINTER(c_int32)), (2 * (arguments.size + 2),)
     )
-    key, lanes, *strides = (int(x) for x in numbers.view(np.int64))
+    key, lanes, *sizes = (int(x) for x in numbers.view(np.int64))
     if key < 0:
         return _run_numpy(frame, _numpy_functions[key])
     kernel = kernel_by_key(key)
@@ -197,7 +197,7 @@ def _run_kernel(frame: _Frame) -> int | None:
         return _error(frame, "The kernel of this program is not of this process.", _INTERNAL)
     inputs = [arguments.items[i].contents.data or 0 for i in range(1, arguments.size)]
     outputs = [results.items[i].contents.data or 0 for i in range(results.size)]
-    work = _running[ctypes.addressof(frame)] = KernelCall(kernel, inputs, strides, outputs, lanes)
+    work = _running[ctypes.addressof(frame)] = KernelCall(kernel, inputs, sizes, outputs, lanes)
     if threading.current_thread() is threading.main_thread():
         succeeded = work.run()
     else:
@@ -264,8 +264,8 @@ def register_handler() -> str:
     return TARGET
 
 
-def header(key: int, lanes: int, strides: list[int]) -> np.ndarray:
-    """Return the first argument of a call: the kernel's key, the number of lanes, and the numbers
-    per lane of each input (0 for a shared one). Each is stored as two 32-bit integers, since JAX
-    may be set to use no 64-bit ones."""
-    return np.asarray([key, lanes, *strides], np.int64).view(np.int32)
+def header(key: int, lanes: int, rows: int, strides: list[int]) -> np.ndarray:
+    """Return the first argument of a call: the kernel's key, the number of lanes, the greatest
+    number of rows, and the numbers per lane of each input (0 for a shared one). Each is stored as
+    two 32-bit integers, since JAX may be set to use no 64-bit ones."""
+    return np.asarray([key, lanes, rows, *strides], np.int64).view(np.int32)

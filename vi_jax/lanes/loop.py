@@ -86,9 +86,9 @@ def run(
     """
     leaves, treedef = jtu.tree_flatten(inputs)
     leaves = [jnp.asarray(x) for x in leaves]
-    program, consts, *structures = traced(Functions(begin, step, end), treedef, leaves, rows=rows)
+    program, consts, *structures = traced(Functions(begin, step, end), treedef, leaves)
     backend = current_backend() if backend is None else backend
-    out = lanes_p.bind(*leaves, *consts, program=program, backend=backend)
+    out = lanes_p.bind(*leaves, *consts, program=program, rows=rows, backend=backend)
     n = len(program.out_avals)
     results, row = map(jtu.tree_unflatten, structures, (out[:n], out[n:]))
     return results, row
@@ -149,7 +149,7 @@ class Traced(NamedTuple):
 _recent: "Recent[Any, Traced]" = Recent(64)
 
 
-def traced(functions: Functions, treedef: object, leaves: Sequence[Any], rows: int) -> Traced:
+def traced(functions: Functions, treedef: object, leaves: Sequence[Any]) -> Traced:
     """Return the program for inputs of this structure, and of these shapes and types."""
     shapes = [shape_of(x) for x in leaves]
     try:
@@ -158,14 +158,13 @@ def traced(functions: Functions, treedef: object, leaves: Sequence[Any], rows: i
             *map(_function_key, functions),
             treedef,
             *((x.shape, x.dtype) for x in shapes),
-            rows,
             bool(jax.config.jax_enable_x64),  # pyright: ignore
         )
         found = _recent.get(key)
     except (TypeError, ValueError):  # without a hash, or equality is not defined
-        return _traced(functions, treedef, shapes, rows)
+        return _traced(functions, treedef, shapes)
     if found is None:
-        found = _traced(functions, treedef, shapes, rows)
+        found = _traced(functions, treedef, shapes)
         if not any(isinstance(x, Tracer) for x in found.consts):
             _recent.put(key, found)
     return found
@@ -216,7 +215,7 @@ def _constant_key(x: object) -> Any:
     return type(x), x
 
 
-def _traced(functions: Functions, treedef: Any, leaves: list[Any], rows: int) -> Traced:
+def _traced(functions: Functions, treedef: Any, leaves: list[Any]) -> Traced:
     n = len(leaves)
     structures: dict[str, Any] = {}
 
@@ -248,7 +247,7 @@ def _traced(functions: Functions, treedef: Any, leaves: list[Any], rows: int) ->
     jaxprs = [begin, jax.make_jaxpr(stepped)(*both), jax.make_jaxpr(ended)(*both)]
     jaxprs, consts = _consts_as_inputs(jaxprs, n)
     begin, step, end = map(Part.of, merged(*jaxprs))
-    program = LaneProgram(parts=(begin, step, end), rows=rows)
+    program = LaneProgram(parts=(begin, step, end))
     return Traced(program, consts, structures["out"], structures["row"])
 
 

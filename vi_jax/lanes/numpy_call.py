@@ -59,7 +59,7 @@ def _results(arrays, shapes, batch):
 
 
 def _by_handler(*arrays, function, shapes, batch):
-    head = header(numpy_key(function), 0, [0] * len(arrays))
+    head = header(numpy_key(function), 0, 0, [0] * len(arrays))
     call = jax.ffi.ffi_call(register_handler(), _results(arrays, shapes, batch))
     return call(head, *arrays)
 

@@ -134,19 +134,20 @@ class Kernel:
 
 
 class KernelCall:
-    """One call of a kernel. It holds the memory that its threads use until they end. An input's
-    stride is the numbers per lane, or 0 if all lanes share it."""
+    """One call of a kernel. It holds the memory that its threads use until they end. `sizes` are
+    the greatest number of rows and the stride of each input: its numbers per lane, or 0 if all
+    lanes share it."""
 
     def __init__(
-        self, kernel: Kernel, inputs: list[int], strides: list[int], outputs: list[int], lanes: int
+        self, kernel: Kernel, inputs: list[int], sizes: list[int], outputs: list[int], lanes: int
     ):
         self._function, self._lanes = kernel.function, lanes
         self._table = (ctypes.c_void_p * max(1, len(inputs)))(*inputs)
-        self._lane_strides = (ctypes.c_int64 * max(1, len(strides)))(*strides)
+        self._sizes = (ctypes.c_int64 * len(sizes))(*sizes)
         self._results = (ctypes.c_void_p * max(1, len(outputs)))(*outputs)
         self._next_lane, self.stop = ctypes.c_int64(0), ctypes.c_int8(0)
         self._arguments = (
-            ctypes.addressof(self._table), ctypes.addressof(self._lane_strides),
+            ctypes.addressof(self._table), ctypes.addressof(self._sizes),
             ctypes.addressof(self._results), lanes, ctypes.addressof(self._next_lane),
             ctypes.addressof(self.stop),
         )  # fmt: skip
