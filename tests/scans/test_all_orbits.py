@@ -100,7 +100,7 @@ def test_interrupted_after_a_period(found, scene, monkeypatch):
     [
         ({"cycles": 0}, "`cycles` must be"),
         ({"starts": 0}, "`starts` must be"),
-        ({"region": {"stops.0.gap": (1.0, 2.0)}}, "`region` must name parts of the start"),
+        ({"region": {"stops.0.gap": (1.0, 2.0)}}, "`region` must name numbers of the start"),
         ({"region": {"start.Z": (1.0, 2.0)}}, "`region` must be a number .* start.Y"),
         ({"region": {"start.Y": (2.0, 1.0)}}, "`region` must give ranges"),
         ({"tolerance": -1.0}, "`tolerance` must be"),

@@ -9,7 +9,8 @@ so that forces λ cause the rates a = G λ + b. Rows are ordered: normals, tange
 
 In an impact the rates are velocities: a_n = v_n⁺ + e v_n⁻ and a_t = v_t⁺ + e_t v_t⁻ (J. J. Moreau).
 The condition without slip is that of D. E. Stewart and J. C. Trinkle (Int. J. Numer. Meth. Eng. 39,
-1996). Lemke's method solves the problem; R. W. Cottle, J.-S. Pang and R. E. Stone, The Linear
+1996). One contact has a closed form, few without friction nearly always an obvious solution;
+otherwise Lemke's method solves the problem. R. W. Cottle, J.-S. Pang and R. E. Stone, The Linear
 Complementarity Problem, 1992.
 """
 

@@ -40,6 +40,7 @@ from ..machine import (
     in_words,
     is_angle,
     modes_of,
+    near_names,
     nearest_images,
     state_in_words,
     unit_of,
@@ -494,16 +495,17 @@ def starts_in(
 ) -> dict[str, np.ndarray]:
     """Return the starts in a region as axes of a scan: those of a grid, or random ones in pairs."""
     ranges = axes_of(region, "region")
+    names = [START + name for name in components(without_modes(begin))]
     for name, row in ranges.items():
         if not name.startswith(START):
             raise ValueError(
-                f'Argument `region` must name parts of the start, "start.Y" and such, but names '
-                f"{name!r}."
+                f"Argument `region` must name numbers of the start, but names {name!r}; "
+                f"{near_names(name, names)}."
             )
         if row.size != 2 or not row[0] < row[1]:
             raise ValueError(
-                "Argument `region` must give ranges (low, high), low < high, of parts of the "
-                f'start, "start.Y" and such, but got {region[name]!r} for {name!r}.'
+                "Argument `region` must give ranges (low, high), low < high, but got "
+                f"{region[name]!r} for {name!r}."
             )
         check_leaf_name(machine, begin, name, "region", None)
     if samples is not None:
