@@ -241,7 +241,8 @@ def _width(program: AnyProgram, lanes: int, bits: int) -> int:
     # of the time, if there are enough lanes for all cores.
     many = lanes >= 4 * full * cores()
     few_numbers = sum(a.size for a in avals) <= _MOST_NUMBERS.get(bits, 0)
-    return 2 * full if many and few_numbers else full
+    # A tape keeps its numbers in memory.
+    return 2 * full if many and few_numbers and isinstance(program, LaneProgram) else full
 
 
 def _new_kernel(
