@@ -267,8 +267,8 @@ class Found(NamedTuple):
     """The unit of the tolerance: the largest unknown, or 1 at rest."""
 
 
-# A residual that is no smaller relative to that of the guess is not one of a root: a choice. Close to
-# a resonance, roots with a million times the size of the residual have smaller ones.
+# A residual above this share of that of the guess is not one of a root: a choice. Close to a
+# resonance, roots of a million times the size of that residual have smaller ones.
 _DECREASE = 1e-3
 
 
