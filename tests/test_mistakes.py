@@ -439,13 +439,13 @@ class Spare(Machine):
 
 @pytest.mark.parametrize(
     ("base", "member"),
-    [(Machine, x) for x in ("cycle", "contacts", "events", "modes")]
+    [(Machine, x) for x in ("cycle", "contacts", "events", "modes", "units", "coordinates")]
     + [(Machine, x) for x in ("field", "start", "step_limit", "averages", "quantities")]
     + [(Masses, x) for x in ("force", "mass", "prescribed", "start")],
 )
 def test_a_method_without_its_return(base, member):
     method = lambda self, *args: None
-    of_property = member in ("cycle", "contacts", "events")
+    of_property = member in ("cycle", "contacts", "events", "units", "coordinates")
     kind = type("Forgetful", (base,), {member: property(method) if of_property else method})
     with warnings.catch_warnings(action="error"):
         said = refused(lambda: vi.simulate(kind(), cycles=1))

@@ -2,6 +2,7 @@
 and type checkers take their types from here."""
 
 from . import machines as machines
+from . import orbit as orbit
 from . import plot as plot
 from ._messages import Interrupted as Interrupted
 from ._programs import keep_programs as keep_programs

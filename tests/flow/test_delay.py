@@ -183,6 +183,88 @@ def test_derivatives_with_delayed_velocity():
         np.testing.assert_allclose(found[:, i], change / (2 * step), atol=1e-7)
 
 
+class Echo(vi.Mechanical):
+    """A body hits a wall. An echo of its velocity pushes a block that friction holds, and lifts one
+    that rests on the floor. Units: m, s, kg, N."""
+
+    gap: float = 0.2
+    delay: float = 0.3
+    level: float = 5.0
+    weight: float = 5.0
+    q = ("striker", "block", "lifted")
+    mass = (1.0, 2.0, 2.0)
+    cycle = 1.0
+    before = property(lambda self: self.start())
+    delays = property(lambda self: dict(echo=self.delay))
+
+    @property
+    def contacts(self):
+        floor = vi.RigidStop(0.0, 0.5, "left", on="lifted")
+        friction = vi.DryFriction(self.level, on="block")
+        return vi.RigidStop(self.gap, 0.5, on="striker"), floor, friction
+
+    def start(self):
+        return self.at(v=dict(striker=1.0))
+
+    def force(self, t, q, v, past):
+        push = 4.9 + 2.4 * (1.0 - past.echo.v.striker)
+        return dict(striker=0.0, block=push, lifted=push - self.weight)
+
+
+def test_an_image_releases_held_bodies():
+    p = jnp.array([0.2, 0.3, 5.1, 5.3])
+
+    def found(p):
+        machine = Echo(*p)
+        run = vi.simulate(machine, cycles=1)
+        return jnp.stack([run.last.block, run.last.lifted])
+
+    def wanted(p):
+        return (8.5 - p[2:]) / 4 * (1 - p[0] - p[1]) ** 2
+
+    np.testing.assert_allclose(found(p), wanted(p), atol=1e-12)
+    np.testing.assert_allclose(jax.jacfwd(found)(p), jax.jacfwd(wanted)(p), atol=1e-10)
+
+
+class Slide(vi.Mechanical):
+    """A slide with friction, a stop and two delayed feedbacks. Units: m, s, kg, N."""
+
+    near: float = 0.035
+    far: float = 0.09
+    level: float = 6.0
+    gap: float = 0.004
+    q, mass, cycle, history_size = "x", 12.0, 1 / 2.6, 501
+    delays = property(lambda self: dict(near=self.near, far=self.far))
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(self.gap, 0.6, on="x"), vi.DryFriction(self.level, on="x")
+
+    def force(self, t, q, v, past):
+        late = 900 * (q.x - past.near.x) - 15 * past.far.v.x
+        return dict(x=60 * jnp.sin(5.2 * jnp.pi * t) - 4800 * q.x - 24 * v.x + late)
+
+
+def test_derivatives_with_friction_and_two_delays():
+    p = jnp.array([0.035, 0.09, 6.0, 0.004])
+
+    @jax.jit
+    def found(p):
+        machine = Slide(*p)
+        last = vi.simulate(machine, machine.at(x=0.001), 1).last
+        return jnp.stack([last.x, last.v.x])
+
+    np.testing.assert_allclose(found(p), [-0.0208936219760, 0.1626080594120], rtol=1e-10)
+    slopes = jax.jit(jax.jacfwd(found))(p) * p
+
+    def difference(i, x):
+        return found(p.at[i].multiply(1 + x)) - found(p.at[i].multiply(1 - x))
+
+    for i, slope in enumerate(slopes.T):
+        wanted = (8 * difference(i, 1e-5) - difference(i, 2e-5)) / 12e-5
+        np.testing.assert_allclose(slope, wanted, atol=1e-9, rtol=1e-6)
+
+
 def test_run_continues_with_its_history():
     first = vi.simulate(Struck(), cycles=1, settle=2)
     second = vi.simulate(Struck(), first.last, cycles=1, settle=1)

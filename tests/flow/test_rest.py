@@ -292,3 +292,39 @@ def test_releases_from_a_curved_gap():
     assert same.rests.sum() > 0 and (run.rests[0, :18] == same.rests).all()
     np.testing.assert_allclose(run.sections.x[0, :19], same.sections.x, atol=1e-10)
     np.testing.assert_allclose(run.sections.th[0, :19], same.sections.th, atol=1e-9)
+
+
+class Pulsed(vi.Mechanical):
+    """A block that friction holds, and one that rests on the floor, under a force that jumps to 8 N
+    at the time `begin` of each cycle, and falls. Units: m, s, kg, N."""
+
+    level: float = 5.0
+    begin: float = 0.0
+    q, mass, cycle = ("block", "lifted"), (2.0, 2.0), 0.5
+
+    @property
+    def contacts(self):
+        floor = vi.RigidStop(0.0, 0.0, "left", on="lifted")
+        return floor, vi.DryFriction(self.level, on="block")
+
+    def force(self, t, q, v):
+        push = jnp.where(t < self.begin, 0.0, 8.0 - 24.0 * (t - self.begin))
+        return dict(block=push, lifted=push - self.level)
+
+
+@pytest.mark.filterwarnings("ignore:.*cycle")
+def test_a_force_that_jumps_releases_held_bodies():
+    def found(level, begin):
+        machine = Pulsed(level=level, begin=begin)
+        run = vi.simulate(machine, machine.at(), 1, settle=1)
+        return jnp.stack([run.y_max[0], (run.last.block - run.sections.block[0])])
+
+    # Along y'' = (8 - L)/2 - 12 t the top is reached at twice the time at which the force vanishes.
+    top = lambda level: ((8 - level) / 2) ** 3 / 216
+    wanted = jnp.stack([top(5.0), top(5.0)])
+    np.testing.assert_allclose(found(5.0, 0.0), wanted, rtol=1e-9)
+    np.testing.assert_allclose(found(5.0, 0.2), wanted, rtol=1e-6)
+    slopes = jax.jacfwd(found)(5.0, 0.0)
+    np.testing.assert_allclose(slopes, jax.grad(top)(5.0) * jnp.ones(2), rtol=1e-9)
+    # JAX does not show where the force jumps: the instant has no derivative.
+    assert np.isnan(jax.jacfwd(found)(5.0, 0.2)).all()

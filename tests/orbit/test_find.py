@@ -345,3 +345,21 @@ def test_a_motion_of_arbitrary_position_is_found_near_the_guess():
     assert float(found.x + found.y) == pytest.approx(0, abs=1e-10)
     drifting = vi.find_orbit(Coupled(push=0.01), guess)
     assert drifting.result == vi.ORBIT_RESULTS.drifts and "drifts" in str(drifting)
+
+
+class Resonant(vi.AbstractMachine):
+    """2 x'' + 50 x = 3 cos ωt, in N, kg and m. Its motion is (1.5 cos ωt)/(25 - ω²)."""
+
+    omega: float = 5.0
+    cycle = property(lambda self: 2 * jnp.pi / self.omega)
+
+    def field(self, t, z):
+        return dict(x=z.u, u=1.5 * jnp.cos(self.omega * t) - 25 * z.x)
+
+
+def test_no_orbit_at_a_resonance_without_damping():
+    start = vi.State(x=0.0, u=0.0)
+    assert vi.find_orbit(Resonant(), start).result == vi.ORBIT_RESULTS.no_orbit
+    orbit = vi.find_orbit(Resonant(5.001), start)
+    assert orbit.successful
+    np.testing.assert_allclose(orbit.state.x, 1.5 / (25 - 5.001**2), rtol=1e-7)

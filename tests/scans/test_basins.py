@@ -1,5 +1,6 @@
 """Basins of attraction, compared with orbits, single runs and SciPy."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -102,3 +103,20 @@ def test_the_share_of_steady_sliding_agrees_with_its_area():
     (share,) = (x.fraction for x in found.attractors if abs(x.sections["Y"][0] - 0.5249) < 1e-3)
     # The boundary cuts about 55 of 24² cells, with an error of 0.3 cells each; allow 3 sigma.
     assert share == pytest.approx(0.30712, abs=3 * 0.3 * 55**0.5 / 24**2)
+
+
+class Pipe(vi.AbstractMachine):
+    """A level with a controller that reads it late. Units: m, s."""
+
+    cycle = 60.0
+    delays = property(lambda self: dict(pipe=22.0))
+
+    def field(self, t, z, past):
+        return dict(h=0.003 * jnp.cos(2 * jnp.pi * t / 60) - 0.04 * past.pipe.h)
+
+
+def test_printed_basins_of_a_chain_do_not_list_its_history():
+    chain = vi.delay_chain(Pipe(), nodes=4, start=vi.State(h=0.0))
+    region = {"start.h": (-0.1, 0.1)}
+    found = vi.basins(chain, region, resolution=2, start=chain.start(), settle=20, progress=False)
+    assert "h = -0.0127" in str(found) and "history" not in str(found)

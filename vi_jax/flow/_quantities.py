@@ -98,7 +98,8 @@ def check_units(machine: AbstractMachine, start: State, observed: tuple[str, ...
     words = [*leaf_names(machine), *leaf_names(start), *components(start)]
     words += [name.rpartition(".")[2] for name in words]
     words += [*fields_with(type(machine), "unit"), *_WITH_UNITS, *observed]
-    unknown = [x for x in machine.units if x and x not in words and not hasattr(machine, x)]
+    units = returned(machine.units, f"`units` of a {type(machine).__name__}", "units by name")
+    unknown = [x for x in units if x and x not in words and not hasattr(machine, x)]
     words += average_names(machine, start) if unknown else ()
     for name in unknown:
         if name not in words:

@@ -140,6 +140,9 @@ class View(Past):
     """The level of that image."""
     starts: tuple[Scalars, ...]
     """For each delay, the starts of its pieces, also of those that are not read."""
+    jump: tuple[Flag, Scalar]
+    """Whether the step begins at a jump or an image of one; and the derivative of that instant, in
+    a number of value 0."""
 
     def __call__(self, machine: Any, s: Scalar, state: State) -> Any:
         return self.form.by_name([x.at(s) for x in self.windows])
@@ -312,7 +315,8 @@ def with_view(plan: Any, history: History, s: Scalar) -> Any:
     same = [jnp.where(x <= image + slack, y, jnp.inf) for x, y in zip(images, levels, strict=True)]
     level = functools.reduce(jnp.minimum, same)
     image = jnp.where(image <= reach, image, jnp.inf)
-    view = View(plan.machine._past.form, windows, reach, image, level, starts)
+    jump = stop_gradient(history.level) >= 0, history.slip
+    view = View(plan.machine._past.form, windows, reach, image, level, starts, jump)
     return dataclasses.replace(plan, machine=reading(plan.machine, view))
 
 
@@ -374,7 +378,11 @@ def new_piece(
     record = lambda s, state: recorded_numbers(smooth.machine, s, state, modes)
     along = lambda s, state: (jnp.ones_like(s), smooth.field(s, state))
     begin, end = (_derivatives(record, along, *x) for x in ((lane.s, lane.state), (s1, state)))
-    return hermite(begin, end, jnp.where(stop_gradient(h) > 0, h, 1.0))
+    # Of so short a step the end adds only rounding, which the derivatives of the piece multiply.
+    short = stop_gradient(h) < plan.in_units(float(jnp.finfo(h.dtype).eps) ** 0.25)
+    nothing = [jnp.zeros_like(begin[0])] * 4
+    known = jnp.stack([*(x * (h**n / math.factorial(n)) for n, x in enumerate(begin)), *nothing])
+    return jnp.where(short, known, hermite(begin, end, jnp.where(stop_gradient(h) > 0, h, 1.0)))
 
 
 # The coefficients by power of a polynomial of degree 7 from its derivatives of order n at 0 and at
@@ -431,7 +439,7 @@ def extended(
     met = taken & (jnp.abs(stop_gradient(trial.s - view.image)) <= slack)
     level = jnp.where(met & (view.level + 1 < view.form.levels), view.level + 1, -1.0)
     jumps = taken & jumps
-    level, slip = jnp.where(jumps, 0.0, level), jnp.where(jumps, arrived.slip, 0.0)
+    level, slip = jnp.where(jumps, 0.0, level), jnp.where(jumps | met, arrived.slip, 0.0)
     waits = ~kept & (history.level >= 0) & ~jumps
     shift, end = arrived.s - s, stop_gradient(arrived.s) + slack
     places, starts = [], []

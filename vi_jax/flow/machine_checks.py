@@ -624,7 +624,7 @@ def check_parts(machine: AbstractMachine) -> None:
             f"The events of a {name} must have at most {_MOST_OUTCOMES} outcomes (`ends`), but "
             f"have {len(outcomes_of(machine))}."
         )
-    count = len(machine.coordinates)
+    count = len(returned(machine.coordinates, f"`coordinates` of a {name}", "a tuple"))
     for i, stop in enumerate(stops_of(machine)):
         for part in ("gap", "restitution"):
             shape = () if callable(getattr(stop, part)) else jnp.shape(getattr(stop, part))

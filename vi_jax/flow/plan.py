@@ -112,6 +112,15 @@ class Plan(eqx.Module):
     a machine whose numbers are about 1. An event that holds a mode has a pair of sizes, out of
     mode 0 and in it, since its guard is another quantity there."""
 
+    def jump_at_start(self, s: Scalar) -> tuple[Flag, Scalar]:
+        """Return whether the field may jump where a step begins, at an image of a jump or where the
+        clock of a cycle begins anew; and the derivative of that instant, in a number of value 0.
+        """
+        # Each release of a body takes a few roundings of the clock.
+        begins = stop_gradient(s) <= self.in_units(1024 * float(jnp.finfo(s.dtype).eps))
+        jump = getattr(getattr(self.machine, "_past", None), "jump", None)
+        return (begins, jnp.zeros_like(s)) if jump is None else (begins | jump[0], jump[1])
+
     def extent(self, k: int) -> Scalar | float:
         """Return the length scale of coordinate number k."""
         return 1.0 if self.extents is None else self.extents[k]

@@ -27,6 +27,7 @@ from ..flow import (
     chosen,
     machine_of,
     preset,
+    shape_of,
     simulate,
 )
 from ..machine import (
@@ -189,6 +190,8 @@ def map_state(machine: AbstractMachine, state: State, name: str = "state") -> St
         )
     if not axes_of(machine, state):
         check_finite(name, state)
+    elif all(map(jnp.size, jtu.tree_leaves(state))):
+        shape_of(name, machine, jtu.tree_map(lambda x: jnp.atleast_1d(x)[0], state))
     check_values(machine, state)
     state = as_floats(machine, state)
     if modes is None:

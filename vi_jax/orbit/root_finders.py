@@ -267,6 +267,11 @@ class Found(NamedTuple):
     """The unit of the tolerance: the largest unknown, or 1 at rest."""
 
 
+# A residual above this share of that of the guess is not one of a root: a choice. Close to a
+# resonance, roots of a million times the size of that residual have smaller ones.
+_DECREASE = 1e-3
+
+
 def find_root(
     root_finder: AbstractRootFinder, residual: Residual, x: Unknowns, cycles: int = 1
 ) -> Found:
@@ -307,4 +312,8 @@ def find_root(
 
     carry = (x, memory, x, nan, nan, jnp.zeros((), jnp.int32), history)
     _, _, best, size, _, steps, history = jax.lax.while_loop(continues, body, carry)
-    return Found(best, size, size <= tolerance * unit(best), steps, history, unit(best))
+    # Without a root, as at a resonance without damping, places far away make a residual small only
+    # relative to themselves.
+    smaller = (size <= tolerance * unit(guess)) | (size <= _DECREASE * history[0])
+    converged = (size <= tolerance * unit(best)) & smaller
+    return Found(best, size, converged, steps, history, unit(best))

@@ -39,6 +39,7 @@ from ..machine import (
     in_rows,
     in_words,
     is_angle,
+    machine_of_chain,
     modes_of,
     near_names,
     nearest_images,
@@ -227,8 +228,10 @@ class Basins(NamedTuple):
 
     def __repr__(self) -> str:
         lines = [f"Basins of {count_of(len(self.attractors), 'periodic motion')}"]
+        is_chain = machine_of_chain(self.machine) is not None
         for a in self.attractors:
-            first = {name: x[0] for name, x in a.sections.items()}
+            parts = a.sections.items()
+            first = {x: y[0] for x, y in parts if not (is_chain and x.startswith("history"))}
             where = state_in_words(first, 6, units_of(self.machine))
             lines.append(
                 f"  {a.label}: period {self.period_of(a.period)}, "

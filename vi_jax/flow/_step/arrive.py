@@ -580,7 +580,9 @@ def _at_release(step: AppliedStep, lane: Lane, k: int, release: Release) -> Lane
     plan, flow, contact = step.plan, step.flow, lane.contact
     assert contact is not None
     free, offset = release.landed, stop_gradient(release.offset)
-    offset = flow.event_offset(flow.force(k), offset)
+    slip = plan.jump_at_start(step.old.s)[1]
+    later = flow.event_offset(flow.force(k), offset, lost=release.lost)
+    offset = jnp.where(release.at_start, offset + slip, later)
     moving = lane.s, lane.state, lane.record.integrals
     _, state, integrals = flow.extrapolate(offset, moving)
     if not stops_are_exact(plan.machine, state):
@@ -616,8 +618,14 @@ def _event_offset(step: AppliedStep, c: Crossing) -> Scalar:
         beyond = trial.s + offset - plan.end(step.old.part)
         offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
     # These derivatives have no meaning if the event was not met.
-    lost = None if c.jumped is None or not c.event.is_plain else c.jumped
-    return flow.event_offset(flow.guard(c.number), offset, c.landed, lost)
+    if c.above is None or c.jumped is None:
+        return flow.event_offset(flow.guard(c.number), offset, c.landed)
+    # A guard that has jumped where the step begins is met at that instant.
+    known, slip = plan.jump_at_start(step.old.s)
+    at_start = c.landed & c.above
+    lost = c.jumped & ~at_start | at_start & ~known
+    later = flow.event_offset(flow.guard(c.number), offset, c.landed & ~at_start, lost)
+    return jnp.where(at_start & known, offset + slip, later)
 
 
 def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_event: State) -> Lane:

@@ -1,5 +1,6 @@
 """A tried step, and the events in it."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -25,6 +26,7 @@ from .guards import (
     crossings,
     guards_error,
     inner_guards,
+    jump_share,
     landing_tolerance,
     may_turn_between,
     separate_stages,
@@ -48,33 +50,43 @@ class Release(NamedTuple):
     """Length of the next step towards the release."""
     offset: Scalar
     """Offset from the step's end to the release."""
+    at_start: Flag
+    """True if the force has jumped where the step begins."""
+    lost: Flag
+    """True if it jumped within the step, so that the release's time has no derivative."""
 
 
 def locate_release(
-    plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, good: Flag, h: Scalar
-) -> Release:
-    """Return the release of coordinate number k, by its rates when free at both ends of the step. A
-    body is held while it is pressed on. It leaves when the acceleration that a free body would have
-    there changes sign. The drive goes on turning, with the reaction of a spring whose end is
-    held."""
+    plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], slopes: Scalars, good: Flag,
+    h: Scalar,
+) -> Release:  # fmt: skip
+    """Return the release of coordinate number k, by its rates when free at both ends of the step,
+    and the `slopes` of its force there. A body is held while it is pressed on. It leaves when the
+    acceleration that a free body would have there changes sign. The drive goes on turning, with the
+    reaction of a spring whose end is held."""
     assert lane.contact is not None
     # Steps approach the release from the pressed side. Each ends a share short of the last
     # estimate, until one is so short that the force is linear over it: choices.
     short, linear = (1e-3, 1e-5) if h.dtype == jnp.float64 else (1e-2, 1e-3)
     close, linear = plan.in_units(landing_tolerance(h)), plan.in_units(linear)
     away = plan.away(k, lane.contact[k])
-    before, after = pin((away * begin.a, away * end.a))
+    before, after = pin(tuple(away * x.a for x in ends))
     rise = stop_gradient(after - before)
     held = good & (away != 0)
     rising = held & (rise > 0)
     offset = -after * h / jnp.where(rising, rise, 1.0)
     near = jnp.abs(stop_gradient(offset)) <= close
     aimed = held & (lane.target == to_release(k))
-    met = rising & aimed & (h <= 2 * linear) & near
+    # A force that jumps does not pass through zero.
+    least = jump_share(h) * plan.extent(k) / plan.unit**2
+    at_start = held & (stop_gradient(before) > least) & plan.jump_at_start(lane.s)[0]
+    met = rising & aimed & (h <= 2 * linear) & near & ~at_start
     # At the start of so short a step the force was all rounding, and may still be: for example that
     # of a stack released as one, whose bodies separate later.
     landed = met | aimed & (h <= close)
-    left = rising & (after > 0) & ~landed
+    left = (rising & (after > 0) | at_start) & ~landed
+    steepest = stop_gradient(functools.reduce(jnp.maximum, map(jnp.abs, slopes)))
+    lost = landed & ~at_start & (rise > _STEEP * steepest * h + least)
     place = stop_gradient(h + offset)
     # If the force is barely positive, but for long, chords hardly advance: bisect.
     share = jnp.where(lane.attempts >= _PATIENCE, 0.5, 1 - short)
@@ -82,10 +94,14 @@ def locate_release(
     # The step ends late by a rounding error, lest the body be pressed on again. No step towards
     # the release is too short to advance the clock.
     late = 8 * float(jnp.finfo(h.dtype).eps) * (plan.unit + stop_gradient(lane.s + h))
-    place = jnp.maximum(place, 2 * late)
+    place = jnp.where(at_start, 2 * late, jnp.maximum(place, 2 * late))
     landed, offset = pin_flag(landed, h), jnp.where(met, offset, 0.0)
-    return Release(pin_flag(left, h), landed, place, jnp.where(landed, offset + late, 0.0))
+    offset = jnp.where(landed, offset + late, 0.0)
+    return Release(pin_flag(left, h), landed, place, offset, at_start, lost)
 
+
+# A force jumps if it changes by more than this multiple of what its slopes allow: a choice.
+_STEEP = 100.0
 
 # A window of force shorter than this share of the longest step moves the body by its third power,
 # 1e-9 of the motion in a whole step.
@@ -317,14 +333,14 @@ def _path(
         brief = stop_gradient(_SLIVER * limit + jnp.zeros_like(h))
 
         def of_force(_: None) -> NearStop:
-            release = locate_release(plan, lane, k, begin, end, good, h)
             places = (lane.s, lane.state), (s1, new)
             first, last = (force_rate(free, body, smooth, *place) for place in places)
+            release = locate_release(plan, lane, k, (begin, end), (first, last), good, h)
             return NearStop(release, first, last, brief)
 
         def far(_: None) -> NearStop:
             no, zero = jnp.zeros_like(good), jnp.zeros_like(h)
-            return NearStop(Release(no, no, h, zero), zero, zero, brief)
+            return NearStop(Release(no, no, h, zero, no, no), zero, zero, brief)
 
         asked = at_rest | may_turn_between(plan, lane, k, stop_gradient((begin, end)), h)
         near = jax.lax.cond(asked, of_force, far, None)
