@@ -406,8 +406,8 @@ class ContactFriction(Friction):
         # The stop's force resists the motion into it, and friction is in proportion to that. Terms
         # of bodies that fall together cancel, but not their rounding.
         body = machine.coordinates[stops_of(machine)[self.stop].coordinate]
-        each, terms = (body, machine.coordinates[self.along]), jtu.tree_map(jnp.abs, flow)
-        return sum(size_of(x.velocity, state, terms) for x in each)
+        along, terms = machine.coordinates[self.along], jtu.tree_map(jnp.abs, flow)
+        return size_of(body.velocity, state, terms) + size_of(along.velocity, state, terms)
 
     def stopped(self, machine, s, state, mode, around):
         # The correction must not change the velocity at the stop.

@@ -563,9 +563,7 @@ def _release_bodies(step: AppliedStep, lane: Lane, releases: dict[int, Release])
         moving = lane.s, lane.state, lane.record.integrals
         later = plan.in_units(_SOON + jnp.zeros_like(lane.s))
         s, soon, _ = step.flow.extrapolate(stop_gradient(later), moving)
-        modes, kept, _ = pressed_contacts(
-            plan.machine, s, soon, lane.modes, contact, opened=before
-        )
+        modes, kept, _ = pressed_contacts(plan.machine, s, soon, lane.modes, contact, opened=before)
         # Contacts that open next have releases of their own.
         pairs = zip(kept, contact, strict=True)
         kept = tuple(jnp.where(x == 0, jnp.abs(old), x) for x, old in pairs)
