@@ -752,13 +752,14 @@ def _resting_bodies(
 
 
 def _slips_after(plan: Plan, lane: Lane, at_event: State) -> dict[int, Scalar]:
-    """Return the slip of each friction after impacts, 0 if the body sticks and no impact changed
-    its slip. `at_event` is the state before them."""
+    """Return the slip of each friction after impacts, 0 if it is rounding, or if the body sticks
+    and no impact changed its slip. `at_event` is the state before them."""
     found, machine = {}, plan.machine
     for i in frictions_in(machine):
         friction = switches_of(machine)[i]
         slip = stop_gradient(friction.speed_of_slip(machine, lane.s, lane.state))
         sticks = jnp.abs(lane.modes[i]) < 1
         sticks = sticks & ~friction.changes(machine, lane.s, at_event, lane.state)
+        sticks = sticks | (jnp.abs(slip) <= plan.slip_rounding(i, lane))
         found[i] = jnp.where(sticks, 0.0, slip)
     return found
