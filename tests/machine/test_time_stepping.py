@@ -213,3 +213,99 @@ def test_random_stacks_on_a_shaken_floor():
     error, good = compared(Stack, given, gaps, places, mass, mu, q, v, pull)
     assert good.all()
     assert (error < np.where(given["restitution"] == 1, 1e-7, 1e-4)).all(), error
+
+
+class Boxes(vi.Mechanical):
+    """Two boxes that turn, one on the other, seen from a shaken floor. Each has two corners on a
+    surface."""
+
+    half_width: Any = None
+    half_height: Any = None
+    mass_of: Any = None
+    mu: Any = None
+    restitution: Any = 0.0
+    sizes: Any = None
+    phases: Any = None
+    cycle: Any = END
+    q = ("x0", "y0", "t0", "x1", "y1", "t1")
+
+    def mass(self, q):  # pyright: ignore[reportIncompatibleVariableOverride]
+        inertia = (self.half_width**2 + self.half_height**2) / 3
+        return tuple(self.mass_of[i] * x for i in range(2) for x in (1.0, 1.0, inertia[i]))
+
+    def corner(self, q, i, side):
+        """Return the height of a corner above the surface below, and its place along it."""
+        x, y, tilt = (getattr(q, f"{name}{i}") for name in "xyt")
+        s, c, b, h = jnp.sin(tilt), jnp.cos(tilt), side * self.half_width[i], self.half_height
+        x, y = x + b * c + h[i] * s, y + b * s - h[i] * c
+        if i == 0:
+            return y, x
+        s, c, x, y = jnp.sin(q.t0), jnp.cos(q.t0), x - q.x0, y - q.y0
+        return c * y - s * x - h[0], c * x + s * y
+
+    @property
+    def contacts(self):
+        return tuple(
+            vi.RigidStop(
+                0.0, self.restitution, "left", friction=self.mu[i],
+                on=lambda q, i=i, b=b: self.corner(q, i, b)[0],
+                along=lambda q, i=i, b=b: self.corner(q, i, b)[1],
+            ) for i in range(2) for b in (-1, 1)
+        )  # fmt: skip
+
+    def force(self, t, q, v):
+        x, y = (floor(t, self.sizes[i], self.phases[i]) for i in range(2))
+        pull = (-x, -9.81 - y, 0.0)
+        return {f"{name}{i}": self.mass_of[i] * p for i in range(2)
+                for name, p in zip("xyt", pull, strict=True)}  # fmt: skip
+
+    def energy(self, z):
+        speeds = jnp.stack([getattr(z.v, name) for name in self.q])
+        own = 0.5 * jnp.sum(jnp.stack(self.mass(z)) * speeds**2)
+        return own + 9.81 * (self.mass_of[0] * z.y0 + self.mass_of[1] * z.y1)
+
+
+def random_boxes(rng, lanes):
+    """Return random stacks: odd ones on a shaken floor, the others dropped on a floor at rest."""
+    shaken, draw = np.arange(lanes) % 2 == 1, rng.uniform
+    sizes, phases = shaking(rng, lanes, 8.0, 6.0)
+    a, h = np.sort(draw(0.1, 0.4, (lanes, 2)), 1)[:, ::-1], draw(0.05, 0.3, (lanes, 2))
+    given = dict(half_width=a, half_height=h, mass_of=draw(0.3, 3.0, (lanes, 2)))
+    given.update(mu=draw(0.1, 0.8, (lanes, 2)), restitution=draw(0, 0.6, lanes))
+    given["restitution"][::5] = 0.0
+    given.update(sizes=sizes * shaken[:, None, None], phases=phases)
+    dropped = ~shaken | (draw(size=lanes) < 0.5)
+    q, v = np.zeros((lanes, 6)), np.zeros((lanes, 6))
+    for n in range(lanes):
+        base = 0.0
+        for i in range(2):
+            tilt = draw(-0.1, 0.1) * (dropped[n] and draw() < 0.7)
+            drop = draw(0, 0.05) * dropped[n]
+            lift = a[n, i] * abs(np.sin(tilt)) + h[n, i] * np.cos(tilt)
+            x, y = draw(-0.03, 0.03) * (i > 0), base + lift + drop
+            q[n, 3 * i : 3 * i + 3], base = (x, y, tilt), y + lift
+        v[n, 0::3] = draw(-1, 1, 2) * dropped[n] * 0.5
+    return given, q, v
+
+
+@pytest.mark.slow
+def test_stacks_of_boxes_come_to_rest():
+    """Five of these were lost: their numbers are 2 to 6. An impact gave corners that stick a slip
+    that vanished within 1e-8 and opened another contact meanwhile, for ever. Bodies that began to
+    slip, without acceleration yet, had the error of their sticking as a slip the other way."""
+    given, q, v = random_boxes(np.random.default_rng(1), 160)
+    some = np.array([20, 24, 22, 55, 59, 87, 95, 53])
+    numbers = jax.tree.map(lambda x: jnp.asarray(x[some]), (given, q, v))
+
+    def one(given, q, v):
+        boxes = Boxes(**given)
+        start = boxes.at(**dict(zip(boxes.q, q, strict=True)), v=dict(zip(boxes.q, v, strict=True)))
+        run = vi.simulate(boxes, start, 4, max_impacts=20_000)
+        corners = [boxes.corner(run.sections, i, b)[0] for i in range(2) for b in (-1, 1)]
+        return jax.vmap(boxes.energy)(run.sections), jnp.stack(corners), run.successful
+
+    energy, corners, good = map(np.asarray, jax.jit(jax.vmap(one))(*numbers))
+    assert good.all()
+    assert corners.min() > -1e-9
+    at_rest = energy[some % 2 == 0]
+    assert (np.diff(at_rest, axis=1) < 1e-9).all()

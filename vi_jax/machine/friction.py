@@ -403,10 +403,11 @@ class ContactFriction(Friction):
         return machine.coordinates[self.along].velocity(state)
 
     def largest_rate(self, machine, s, state, flow):
-        # The stop's force resists the motion into it, and friction is in proportion to that.
+        # The stop's force resists the motion into it, and friction is in proportion to that. Terms
+        # of bodies that fall together cancel, but not their rounding.
         body = machine.coordinates[stops_of(machine)[self.stop].coordinate]
-        pressing = jnp.abs(velocity_change(body, state, flow))
-        return super().largest_rate(machine, s, state, flow) + pressing
+        along, terms = machine.coordinates[self.along], jtu.tree_map(jnp.abs, flow)
+        return size_of(body.velocity, state, terms) + size_of(along.velocity, state, terms)
 
     def stopped(self, machine, s, state, mode, around):
         # The correction must not change the velocity at the stop.
@@ -475,16 +476,17 @@ def settled_contacts(
         begins = tuple(released.get(i, none) for i in frictions_in(machine))
     slip_of, solve = (cast(Any, x) for x in (_slips, _settled))
     given = slip_of(machine, s, state, modes, begins)
-    return solve(machine, s, state, modes, contact, *given, contact, None)
+    return solve(machine, s, state, modes, contact, *given, contact, None)[:2]
 
 
 def pressed_contacts(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
     opened: Scalars | None = None, touching: tuple[Flag, ...] | None = None,
-) -> tuple[Scalars, Scalars]:  # fmt: skip
-    """Return the modes, and the contacts (as in `EventContext`) without those that the forces of
-    this state open. Of those that are `opened`, the spare ones stay closed; of those that are only
-    `touching`, those that are pressed on. Frictions that slip in `modes` go on."""
+) -> tuple[Scalars, Scalars, Scalars]:  # fmt: skip
+    """Return the modes; the contacts (as in `EventContext`) without those that the forces of this
+    state open; and the rate of each friction's slip, 0 where none touches. Of the contacts that are
+    `opened`, the spare ones stay closed; of those that are only `touching`, those that are pressed
+    on. Frictions that slip in `modes` go on."""
     indices, switches, solve = frictions_in(machine), switches_of(machine), cast(Any, _settled)
     slips = tuple(slip_in(modes[i]) for i in indices)
     ratios = (switches[i].static_share(machine, s, state) for i in indices)
@@ -517,19 +519,24 @@ def _slips(
 def _settled(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
     slips: Scalars, holds: Scalars, opened: Scalars, touching: tuple[Flag, ...] | None,
-) -> tuple[Scalars, Scalars]:  # fmt: skip
-    """Return the modes with those of all frictions, by their slips, and the contacts that stay
-    closed, spare ones with a minus (see `Lane.contact`); jitted like `_solve_forces`."""
+) -> tuple[Scalars, Scalars, Scalars]:  # fmt: skip
+    """Return the modes with those of all frictions, by their slips; the contacts that stay closed,
+    spare ones with a minus (see `Lane.contact`); and the rates of the slips; jitted like
+    `_solve_forces`."""
     contact = tuple(jnp.abs(x) for x in contact) if len(limited_in(machine)) > 1 else contact
     new, kept, switches = list(modes), list(contact), switches_of(machine)
     for i, slip in zip(frictions_in(machine), slips, strict=True):
         new[i] = slip
+    rates = {i: jnp.zeros_like(s) for i in frictions_in(machine)}
     if not contact and not any(x.is_dry for x in switches):
-        return tuple(new), contact
+        return tuple(new), contact, tuple(rates.values())
     order, touches, answer = settled_forces(machine, s, state, modes, contact, slips, holds)
+    pace = machine.pace(s, state)
     for n, i in enumerate(order):
         mode = jnp.where(answer.unsolved, jnp.nan, answer.mode[n])
         new[i] = jnp.where(touches[n], mode, new[i])
+        rate = answer.rate[len(answer.rate) - len(order) + n]
+        rates[i] = jnp.where(touches[n], rate if pace is None else rate * pace, 0.0)
     for row, k in enumerate(limited_in(machine) if contact else ()):
         stays = answer.kept[row] | answer.unsolved
         if touching is not None:
@@ -538,7 +545,7 @@ def _settled(
         if len(kept) > 1:
             spare = answer.spare[row] & ~answer.unsolved
             kept[k] = jnp.where(spare, -jnp.abs(opened[k]), kept[k])
-    return tuple(new), tuple(kept)
+    return tuple(new), tuple(kept), tuple(rates.values())
 
 
 def settled_forces(

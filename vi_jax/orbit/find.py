@@ -642,7 +642,7 @@ def _with_rests(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
     if not stops_of(machine):
         return in_modes(machine, modes)
     contact = closed_contacts(machine, s, state, modes)[0]
-    return SmoothMachine(machine, *pressed_contacts(machine, s, state, modes, contact))
+    return SmoothMachine(machine, *pressed_contacts(machine, s, state, modes, contact)[:2])
 
 
 def _state_tolerance(dtype: object) -> float:

@@ -18,10 +18,12 @@ from ...machine import (
     events_of,
     frictions_in,
     guard_of,
+    has_contact_friction,
     has_velocity,
     holds_anywhere,
     is_compound,
     limited_in,
+    on_held_surfaces,
     others_of,
     outcomes_of,
     pressed_contacts,
@@ -168,7 +170,7 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
     settled, logged = None, happens
     if released:
         given = lane._replace(state=new, modes=modes)
-        modes, (any_event, kept) = _after_friction(plan, given, released)
+        new, modes, (any_event, kept) = _after_friction(plan, given, released)
         for i, (_, here) in released.items():
             mode, old_mode = slip_in(modes[i]), slip_in(modes_before[i])
             value = jnp.where(here, mode, value)
@@ -196,25 +198,29 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
 
 def _after_friction(
     plan: Plan, lane: Lane, events: dict[int, tuple[Flag, Flag]]
-) -> tuple[Scalars, tuple[Flag, Scalars]]:
-    """Return the modes after an event of a friction, and whether one happened and the contacts
-    then; without one the modes of the lane. `events`: for each friction's mode, whether its force
-    became too large, and whether its event happened."""
+) -> tuple[State, Scalars, tuple[Flag, Scalars]]:
+    """Return state and modes after an event of a friction, and whether one happened and the
+    contacts then; without one those of the lane. `events`: for each friction's mode, whether its
+    force became too large, and whether its event happened."""
     any_event = any_of(jnp.zeros((), bool), (here for _, here in events.values()))
     released = {i: when for i, (when, _) in events.items()}
 
     contact = lane.contact or ()
 
-    def settled() -> tuple[Scalars, Scalars]:
+    def settled() -> tuple[State, Scalars, Scalars]:
         # A slip whose event happened is zero now, to the rounding of a surface's speed.
         stopped = {i: jnp.where(here, 0.0, lane.modes[i]) for i, (_, here) in events.items()}
-        modes = tuple(stopped.get(i, mode) for i, mode in enumerate(lane.modes))
-        modes, kept = settled_contacts(plan.machine, lane.s, lane.state, modes, contact, released)
-        return constant_modes(modes, lane.s), kept
+        modes, state = tuple(stopped.get(i, mode) for i, mode in enumerate(lane.modes)), lane.state
+        if has_contact_friction(plan.machine):
+            # A body that begins to slip has no acceleration yet. The error of steps with which it
+            # stuck would count as another slip that vanishes.
+            state = on_held_surfaces(plan.machine, lane.s, state, modes, contact)
+        modes, kept = settled_contacts(plan.machine, lane.s, state, modes, contact, released)
+        return state, constant_modes(modes, lane.s), kept
 
-    old = lane.modes, tuple(map(jnp.abs, contact))
-    modes, kept = jax.lax.cond(any_event, settled, lambda: old)
-    return modes, (any_event, kept)
+    old = lane.state, lane.modes, tuple(map(jnp.abs, contact))
+    state, modes, kept = jax.lax.cond(any_event, settled, lambda: old)
+    return state, modes, (any_event, kept)
 
 
 def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, here: Flag) -> Lane:
@@ -558,7 +564,7 @@ def _release_bodies(step: AppliedStep, lane: Lane, releases: dict[int, Release])
         moving = lane.s, lane.state, lane.record.integrals
         later = plan.in_units(_SOON + jnp.zeros_like(lane.s))
         s, soon, _ = step.flow.extrapolate(stop_gradient(later), moving)
-        modes, kept = pressed_contacts(plan.machine, s, soon, lane.modes, contact, opened=before)
+        modes, kept, _ = pressed_contacts(plan.machine, s, soon, lane.modes, contact, opened=before)
         # Contacts that open next have releases of their own.
         pairs = zip(kept, contact, strict=True)
         kept = tuple(jnp.where(x == 0, jnp.abs(old), x) for x, old in pairs)

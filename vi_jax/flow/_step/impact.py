@@ -26,6 +26,7 @@ from ...machine import (
     chosen_stop,
     contact_constraints,
     forces,
+    frictions_in,
     has_contact_friction,
     holds_anywhere,
     impact_on,
@@ -408,8 +409,8 @@ def bring_to_rest(
         near, distances = _near_contacts(plan, lane, met, impacts)
 
         def hold(found: tuple[Lane, Scalar, Scalar]) -> tuple[Lane, Scalar, Scalar]:
-            rests, times = _resting_bodies(plan, lane, near, distances, before=found[1])
-            return _hold_resting(plan, step.taken, lane, at_event, rests, near, times)
+            rests, times, modes = _resting_bodies(plan, lane, at_event, near, distances, found[1])
+            return _hold_resting(plan, step.taken, lane, at_event, rests, near, times, modes)
 
         # If another body would reach one that rests, only those rest whose impacts are over first.
         begin = lane, lane.s + jnp.inf, jnp.ones_like(lane.s)
@@ -464,12 +465,12 @@ def _near_contacts(
 
 def _hold_resting(
     plan: Plan, taken: Flag, lane: Lane, at_event: State, rests: dict[int, Flag],
-    impacts: dict[int, ImpactResult], times: dict[int, Scalar],
+    impacts: dict[int, ImpactResult], times: dict[int, Scalar], modes: Scalars | None = None,
 ) -> tuple[Lane, Scalar, Scalar]:  # fmt: skip
     """Return the lane after the infinitely many last impacts, with those bodies held that come to
     rest; the time that these impacts take; and 1 if none is held, since another body would reach
-    one before. `at_event` is the state before the impacts. For each coordinate: `rests`, whether it
-    comes to rest; `times`, the time until then (in s)."""
+    one before. `at_event` is the state before the impacts; `modes` are those after them, if known.
+    For each coordinate: `rests`, whether it comes to rest; `times`, the time until then (in s)."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     wait = blocked = jnp.zeros_like(s)
@@ -477,10 +478,11 @@ def _hold_resting(
         time = jnp.where(ends, times[k], 0.0)
         wait = time if len(rests) == 1 else jnp.maximum(wait, time)
         contact = with_item(contact, k, jnp.where(ends, impacts[k].contact, contact[k]))
-    contacts, modes = {k: impact.contact for k, impact in impacts.items()}, lane.modes
+    contacts, given = {k: impact.contact for k, impact in impacts.items()}, modes
+    modes = lane.modes if given is None else given
     if has_contact_friction(plan.machine):
-        # The direction of slip is known after the impact.
-        modes = struck_modes(plan.machine, s, state, modes, contact=contact, before=at_event)
+        if given is None:  # the direction of slip is known after the impact
+            modes = struck_modes(plan.machine, s, state, modes, contact=contact, before=at_event)
         slowed, rebound_energy = _without_rebounds(plan, s, state, modes, rests, contacts)
         still, lost = stop_bodies(plan, s, slowed, rests, contacts)
         lost = lost + rebound_energy
@@ -617,23 +619,32 @@ def _remaining_chatter(
     force = pressing * (1 - impact.share)
     ends = force > 0
     time = jnp.where(ends, 2 * speed / jnp.where(ends, force, 1.0), jnp.inf)
-    limit, share = _longest_chatter(plan, lane)
-    # Hops no higher than rounding cannot be resolved, however long they last.
     height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
     growth = force_rate(free, body, free, s, at_rest)
     not_yet, hop, wait = _time_until_pressed(speed, pressing, sign * growth)
     height = jnp.where(not_yet, speed * hop - 0.5 * pressing * hop * hop, height)
     size = plan.extent(k) + jnp.abs(gap)
-    roundings = _FLAT if len(lane.contact or ()) == 1 else _FLAT_IN_TURN
-    flat = stop_gradient(height) <= roundings * float(jnp.finfo(s.dtype).eps) * size
     time = jnp.where(not_yet, wait, time)
-    brief = share * limit
-    ends = stop_gradient(time) <= jnp.where(flat, 0.1 * limit, brief)
+    flat, longest, brief = _longest_wait(plan, lane, height, size)
+    ends = stop_gradient(time) <= longest
     ends = ends & (flat | ~not_yet | (hop <= brief))
     ends = ends & (distance <= (0.5 * jnp.maximum(pressing, 0.0) * brief + speed) * brief)
     if plan.s_counts_cycles(lane.state):
         ends = ends & (stop_gradient(s + time) < stop_gradient(plan.end(lane.part)))
     return ends, time
+
+
+def _longest_wait(
+    plan: Plan, lane: Lane, height: Scalar, size: Scalar | float
+) -> tuple[Flag, Scalar, Scalar]:
+    """Return whether hops of this height, in a motion of this size, are flat; the longest series
+    of them that is completed; and the longest one if they are not flat. Hops no higher than
+    rounding cannot be resolved, however long they last."""
+    limit, share = _longest_chatter(plan, lane)
+    roundings = _FLAT if len(lane.contact or ()) == 1 else _FLAT_IN_TURN
+    flat = stop_gradient(height) <= roundings * float(jnp.finfo(height.dtype).eps) * size
+    brief = share * limit
+    return flat, jnp.where(flat, 0.1 * limit, brief), brief
 
 
 def _time_until_pressed(
@@ -666,15 +677,22 @@ def _remaining_contacts(
 
 
 def _resting_bodies(
-    plan: Plan, lane: Lane, impacts: dict[int, ImpactResult], distances: dict[int, Scalar],
-    before: Scalar,
-) -> tuple[dict[int, Flag], dict[int, Scalar]]:  # fmt: skip
+    plan: Plan, lane: Lane, at_event: State, impacts: dict[int, ImpactResult],
+    distances: dict[int, Scalar], before: Scalar,
+) -> tuple[dict[int, Flag], dict[int, Scalar], Scalars | None]:  # fmt: skip
     """Return for each coordinate that was struck, or is nearly, whether it comes to rest in a
-    shorter time than `before`, and that time. `distances` are those from the stops. A body may be
+    shorter time than `before`, and that time; and the modes then, if there is contact friction.
+    `at_event` is the state before the impacts, `distances` are those from the stops. A body may be
     pressed on by another that comes to rest at the same instant. Therefore each is tested while
-    those of the others that rest so far and are pressed on are held, until none changes."""
+    those of the others that rest so far and are pressed on are held, until none changes.
+
+    So may a body that sticks. An impact may give it a slip that friction stops in a shorter time
+    than a series of impacts may take. Such a slip counts as stopped: else the contact that it opens
+    closes at once, with another impact, in a series without an end."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
+    machine = plan.machine
+    slips = _slips_after(plan, lane, at_event) if has_contact_friction(machine) else {}
     free = in_modes(plan.machine, lane.modes)
     speeds = {}
     closed = list(contact)
@@ -686,9 +704,11 @@ def _resting_bodies(
         closed[k] = jnp.where(stays, hit.contact, contact[k])
 
     def update(found):
-        closed, _, _, count = found
-        new, times = list(contact), []
-        modes, held = pressed_contacts(plan.machine, s, state, lane.modes, closed)
+        closed, _, moves, _, _, count = found
+        new, times, given = list(contact), [], list(lane.modes)
+        for i, moving in zip(slips, moves, strict=True):
+            given[i] = moving * jnp.sign(slips[i])
+        modes, held, rates_of_slips = pressed_contacts(machine, s, state, tuple(given), closed)
         for k, hit in impacts.items():
             free_k = hold_contacts(plan.machine, modes, held, but=k)
             # Of contacts struck in turn, each may leave faster than its law says, and all shrink.
@@ -704,17 +724,42 @@ def _resting_bodies(
             ends = (hit.contact > 0) & (ends | spare) & (stop_gradient(time) < before)
             new[k] = jnp.where(ends, hit.contact, contact[k])
             times.append(jnp.where(ends, time, 0.0))
+        still = []
+        for (i, slip), rate, moving in zip(slips.items(), rates_of_slips, moves, strict=False):
+            against = stop_gradient(slip * rate) < 0
+            rate = stop_gradient(jnp.where(against, jnp.abs(rate), 1.0))
+            along = getattr(switches_of(machine)[i], "along", None)
+            size = 0.0 if along is None else plan.extent(along)
+            _, longest, _ = _longest_wait(plan, lane, 0.5 * slip * slip / rate, size)
+            stops = against & (jnp.abs(slip) <= rate * longest)
+            still.append(jnp.where(stops, 0.0, moving))
         changed = jnp.zeros((), bool)
-        for old, x in zip(closed, new, strict=True):
+        for old, x in zip((*closed, *moves), (*new, *still), strict=True):
             changed = changed | (old != x)
-        return tuple(new), tuple(times), jnp.where(changed, 1.0, 0.0), count + 1.0
+        carried = tuple(new), tuple(times), tuple(still), modes
+        return *carried, jnp.where(changed, 1.0, 0.0), count + 1.0
 
     zero = jnp.zeros_like(s)
-    begin = tuple(closed), tuple(zero for _ in impacts), zero + 1.0, zero
-    found, times, _, _ = jax.lax.while_loop(
-        lambda x: (x[2] > 0) & (x[3] <= len(impacts)), update, begin
-    )
+    begin = tuple(closed), tuple(zero for _ in impacts), tuple(zero + 1.0 for _ in slips)
+    found, times, _, modes, _, _ = jax.lax.while_loop(
+        lambda x: (x[-2] > 0) & (x[-1] <= len(impacts) + len(slips)), update,
+        (*begin, lane.modes, zero + 1.0, zero),
+    )  # fmt: skip
     ends = {
         k: pin_flag((hit.contact > 0) & (found[k] == hit.contact), s) for k, hit in impacts.items()
     }
-    return ends, dict(zip(impacts, times, strict=True))
+    return ends, dict(zip(impacts, times, strict=True)), modes if slips else None
+
+
+def _slips_after(plan: Plan, lane: Lane, at_event: State) -> dict[int, Scalar]:
+    """Return the slip of each friction after impacts, 0 if it is rounding, or if the body sticks
+    and no impact changed its slip. `at_event` is the state before them."""
+    found, machine = {}, plan.machine
+    for i in frictions_in(machine):
+        friction = switches_of(machine)[i]
+        slip = stop_gradient(friction.speed_of_slip(machine, lane.s, lane.state))
+        sticks = jnp.abs(lane.modes[i]) < 1
+        sticks = sticks & ~friction.changes(machine, lane.s, at_event, lane.state)
+        sticks = sticks | (jnp.abs(slip) <= plan.slip_rounding(i, lane))
+        found[i] = jnp.where(sticks, 0.0, slip)
+    return found
