@@ -366,7 +366,7 @@ class Rotation(AbstractMeasure):
     number is that of turns around the mean of the sections, from 0 to 1/2, as ρ and 1 - ρ are the
     same curve. It is NaN for a fixed point, and where averages agree to less than 3.5 digits, as on
     chaotic motions. It is NaN also if for some q ≤ 12 every q-th section does not turn q times as
-    far, to 0.01: on several closed curves that the sections visit in turn, as beyond a
+    far, to 0.02: on several closed curves that the sections visit in turn, as beyond a
     Neimark–Sacker point of a motion of period q; on a curve that does not wind once around its
     mean; and sometimes close to a resonance. `find_torus` with the number of `cycles` gives the
     rotation number of several curves. A motion that slowly settles on a periodic one has many
