@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from matplotlib.figure import Figure
+from vi_jax.orbit.torus_equations import _solve_bordered
 
 from kicked import SHEAR, TWIST, Alternating, Repelling, Ring, at, rotation_of
 
@@ -142,3 +143,21 @@ def test_motions_that_are_no_torus_are_refused():
         vi.find_torus(Ring(0.21, 1.4), at(0.3, 0.1))
     with pytest.raises(ValueError, match="`nodes` must be odd"):
         vi.find_torus(Ring(0.21, 0.1), at(0.3, 0.1), nodes=32)
+
+
+def test_the_elimination_of_unknowns_of_single_rows():
+    """The dense system of all unknowns has the same solution."""
+    rng, count, width, extra = np.random.default_rng(0), 5, 4, 2
+    own, after = rng.normal(size=(2, count, width, width))
+    after[:, :, [1, 3]] = 0
+    shift, shared = rng.normal(size=(count, count)), rng.normal(size=(count, width, extra))
+    left, right = (
+        rng.normal(size=(extra, count * width + extra)),
+        rng.normal(size=(count, width, 2)),
+    )
+    values = rng.normal(size=(extra, 2))
+    blocks = np.einsum("jab,ji->jaib", after, shift) + np.einsum("jab,ji->jaib", own, np.eye(count))
+    rows = np.hstack([blocks.reshape(20, 20), shared.reshape(20, extra)])
+    dense = np.linalg.solve(np.vstack([rows, left]), np.vstack([right.reshape(20, 2), values]))
+    found = _solve_bordered(own, after, shift, shared, left, right, values)
+    np.testing.assert_allclose(found, dense, atol=1e-11 * np.abs(dense).max())

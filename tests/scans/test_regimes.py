@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.orbit import MotionSections, agreement, rotation_number
+from vi_jax.orbit import MotionSections, agreement, checked_rotation_number, rotation_number
 from vi_jax.scans.measures import least_period
 
-from kicked import Ring, at, rotation_of
+from kicked import Alternating, Ring, at, rotation_of
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
 
@@ -168,6 +168,27 @@ def test_a_rotation_number_without_meaning_is_nan():
     assert np.isnan(rotation_number(1 + 1e-8 * rows, wander=1e-8))
     data = vi.scan(Ring(0.2, 1.4), {"a": [0.21]}, measure="rotation", start=at(0.3, 0.1))
     assert data.digits.values[0] < 3.5 and np.isnan(data.rotation.values[0])
+
+
+def test_rotation_numbers_of_other_curves_are_nan():
+    """On two curves the angle around their common mean turns by 1/2 in each cycle; on a crescent
+    whose mean is outside it does not turn. A motion that repeats keeps its number."""
+    checked, turns = jax.jit(checked_rotation_number), 2 * np.pi * np.arange(1024)
+    circle = lambda a: jnp.stack([jnp.cos(a), jnp.sin(a)], axis=1)
+    one, sides = circle(0.21 * turns), jnp.asarray([[1.0, 0.0], [-1.0, 0.0]] * 512)
+    assert checked(one) == pytest.approx(0.21, abs=1e-9)
+    for radius in (0.5, 1e-2, 1e-6):
+        assert rotation_number(radius * one + sides) == pytest.approx(0.5, abs=1e-4)
+        assert np.isnan(checked(radius * one + sides))
+    # Two curves around a common mean: in two cycles the motion turns by 0.42.
+    assert checked(one + 0.1 * sides) == pytest.approx(0.21, abs=1e-9)
+    bent = (1 + 0.1 * one[:, :1]) * circle(2 * one[:, 1])
+    assert rotation_number(bent) < 0.02 and np.isnan(checked(bent))
+    for p, q in ((1, 2), (1, 3), (2, 5), (3, 8)):
+        assert checked(circle(p / q * turns)) == pytest.approx(p / q, abs=1e-12)
+    options: Any = {"start": at(2.3, 0.1), "settle": 500, "progress": False}
+    data = vi.scan(Alternating(0.21, 0.1), {"a": [0.21]}, measure="rotation", **options)
+    assert np.isnan(data.rotation.values).all() and (data.digits.values > 5).all()
 
 
 @pytest.mark.slow

@@ -15,7 +15,8 @@ from .results import (
 )
 from .root_finders import AbstractRootFinder, Gradient, Newton
 from .birkhoff import (
-    QUASIPERIODIC, WANDERS, agreement, digits_of, rotation_number, weights, without_angles,
+    QUASIPERIODIC, WANDERS, agreement, checked_rotation_number, digits_of, rotation_number,
+    weights, without_angles,
 )
 from .tolerances import ALIKE, CORRECTED, FAINT, LOCATED, ROUNDINGS
 

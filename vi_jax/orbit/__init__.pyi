@@ -4,8 +4,8 @@
 # fmt: off
 from .birkhoff import (
     QUASIPERIODIC as QUASIPERIODIC, WANDERS as WANDERS, agreement as agreement,
-    digits_of as digits_of, rotation_number as rotation_number, weights as weights,
-    without_angles as without_angles,
+    checked_rotation_number as checked_rotation_number, digits_of as digits_of,
+    rotation_number as rotation_number, weights as weights, without_angles as without_angles,
 )
 from .closed_form import (
     ClosedFormOrbits as ClosedFormOrbits, closed_form_orbits as closed_form_orbits,

@@ -4,8 +4,10 @@ On quasi-periodic motions they converge faster than any power of the number of s
 Sander and Yorke 2017), on chaotic ones as slowly as plain averages.
 """
 
+from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -22,6 +24,11 @@ QUASIPERIODIC = 4.4
 
 # Averages agree to so many digits at most, the rounding of double precision.
 _MOST = 16.0
+
+# The largest lag at which rotation numbers are compared, the fewest sections for each, and the
+# least difference, in turns: choices. Of 1,357 random curves of five harmonics with 1,024 sections,
+# 151 had a wrong number: 150 of these differed by more, and 38 of the others.
+_LAGS, _FEWEST, _DIFFERS = 12, 64, 0.02
 
 
 def weights(number: int) -> np.ndarray:
@@ -68,9 +75,12 @@ def _moves(spread: Array, size: Array, wander: Number) -> Array:
     return spread > still * jnp.maximum(jnp.abs(size), 1.0)
 
 
-def rotation_number(rows: Float[Array, "sections states"], wander: Number = 0.0) -> Scalar:
-    """Return the mean angle, in turns from 0 to 1/2, by which sections move on around their mean.
-    It is NaN for a fixed point, and for states of one number. **Arguments:** as of `agreement`.
+def rotation_number(
+    rows: Float[Array, "sections states"], wander: Number = 0.0, lag: Any = 1
+) -> Scalar:
+    """Return the mean angle, in turns from 0 to 1/2, by which every `lag`-th section moves on
+    around the mean of these. It is NaN for a fixed point, and for states of one number.
+    **Other arguments:** as of `agreement`.
 
     The angle is seen in the plane of the two directions of largest spread. Steps of the angle are
     counted from the middle of the widest gap between them, so a curve that is not a circle matters
@@ -78,17 +88,43 @@ def rotation_number(rows: Float[Array, "sections states"], wander: Number = 0.0)
     """
     if rows.shape[1] < 2:
         return jnp.full((), jnp.nan, rows.dtype)
-    weight = jnp.asarray(weights(len(rows)))
-    centred, size = rows - weight @ rows, jnp.std(rows, axis=0)
+    place, number = jnp.arange(len(rows)), (len(rows) - 1) // lag + 1
+    counts, rows = (place < number)[:, None], rows[jnp.minimum(place * lag, len(rows) - 1)]
+    centred = jnp.where(counts, rows - _first_weights(len(rows), number) @ rows, 0.0)
+    size = jnp.std(rows, axis=0, where=counts)
     moves = _moves(size, jnp.max(jnp.abs(rows), axis=0), wander)
     scaled = jnp.where(moves, centred / jnp.where(moves, size, 1.0), 0.0)
     _, directions = jnp.linalg.eigh(scaled.T @ scaled)
     x, y = (scaled @ directions[:, -2:]).T
     steps = jnp.mod(jnp.diff(jnp.arctan2(y, x)) / (2 * jnp.pi), 1.0)
+    steps = jnp.where(place[1:] < number, steps, steps[0])
     order = jnp.sort(steps)
     gaps = jnp.diff(jnp.append(order, order[0] + 1))
     widest = jnp.argmax(gaps)
     cut = order[widest] + 0.5 * gaps[widest]
-    mean = jnp.asarray(weights(len(rows) - 1)) @ jnp.mod(steps - cut, 1.0)
-    turn = jnp.mod(mean + cut, 1.0)
-    return jnp.where(jnp.any(moves), jnp.minimum(turn, 1 - turn), jnp.nan)
+    mean = _first_weights(len(steps), number - 1) @ jnp.mod(steps - cut, 1.0)
+    return jnp.where(jnp.any(moves), _up_to_half(mean + cut), jnp.nan)
+
+
+def checked_rotation_number(rows: Float[Array, "sections states"], wander: Number = 0.0) -> Scalar:
+    """Return the rotation number; NaN also if every q-th section does not turn q times as far for
+    some q ≤ 12. So it is on several closed curves, which the sections visit in turn, and on a
+    curve that does not wind once around its mean."""
+    lags = jnp.arange(1, max(1, min(_LAGS, len(rows) // _FEWEST)) + 1)
+    turns = jax.lax.map(partial(rotation_number, rows, wander), lags)
+    # A lag after which the motion repeats gives NaN, which does not differ.
+    differs = jnp.abs(turns - _up_to_half(lags * turns[0])) > _DIFFERS
+    return jnp.where(jnp.any(differs), jnp.nan, turns[0])
+
+
+def _up_to_half(turns: Array) -> Array:
+    turns = jnp.mod(turns, 1.0)
+    return jnp.minimum(turns, 1 - turns)
+
+
+def _first_weights(number: int, count: Any) -> Array:
+    """Return the `weights` of the first `count` of so many instants, and zeros."""
+    place = (jnp.arange(number) + 0.5) / count
+    inside = place < 1
+    weight = jnp.where(inside, jnp.exp(-1 / jnp.where(inside, place * (1 - place), 1.0)), 0.0)
+    return weight / weight.sum()

@@ -84,6 +84,47 @@ def _on_section(problem: Shooting, x):
     return ravel_pytree(problem.state_at(x, leg, clock))[0]
 
 
+def _solve_bordered(
+    own: np.ndarray, after: np.ndarray, shift: np.ndarray, shared: np.ndarray, left: np.ndarray,
+    right: np.ndarray, values: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Return x and s with own x + after (shift x) + shared s = right in each row, and
+    left (x, s) = values; several right sides, in columns.
+
+    Only the first event of the following row occurs in `after`. The other unknowns of each row are
+    eliminated, so that the dense system is small also for motions with many events.
+    """
+    count, width, extra = *own.shape[:2], shared.shape[2]
+    joined = np.any(after != 0, axis=(0, 1))
+    inner = width - int(joined.sum())
+    turned, upper = np.linalg.qr(own[:, :, ~joined], mode="complete")
+    turn = lambda a: np.swapaxes(turned, 1, 2) @ a
+    own, after = turn(own[:, :, joined]), turn(after[:, :, joined])
+    shared, right = turn(shared), turn(right)
+    solve = lambda a: np.linalg.solve(upper[:, :inner], a[:, :inner])
+    own_in, after_in, shared_in, right_in = (solve(a) for a in (own, after, shared, right))
+    matrix = np.einsum("jab,ji->jaib", after[:, inner:], shift)
+    matrix[np.arange(count), :, np.arange(count)] += own[:, inner:]
+    total = count * (width - inner)
+    upper_rows = np.hstack([matrix.reshape(total, total), shared[:, inner:].reshape(total, extra)])
+    by_x, by_shared = left[:, :-extra].reshape(-1, count, width), left[:, -extra:]
+    by_inner = by_x[:, :, ~joined]
+    by_x = by_x[:, :, joined] - np.einsum("cja,jab->cjb", by_inner, own_in)
+    by_x -= np.einsum("cja,jab,ji->cib", by_inner, after_in, shift, optimize=True)
+    by_shared = by_shared - np.einsum("cja,jab->cb", by_inner, shared_in)
+    values = values - np.einsum("cja,jab->cb", by_inner, right_in)
+    found = np.linalg.solve(
+        np.vstack([upper_rows, np.hstack([by_x.reshape(-1, total), by_shared])]),
+        np.concatenate([right[:, inner:].reshape(total, -1), values]),
+    )
+    x, s = found[:total].reshape(count, width - inner, -1), found[total:]
+    rows = np.empty((count, width, x.shape[2]))
+    rows[:, joined] = x
+    following = np.tensordot(shift, x, 1)
+    rows[:, ~joined] = right_in - own_in @ x - after_in @ following - shared_in @ s
+    return np.concatenate([rows.reshape(count * width, -1), s])
+
+
 def begins_on_section(problem: Shooting) -> bool:
     return bool(problem.events) and problem.events[0].cycle == 0
 
@@ -256,19 +297,18 @@ class Equations:
             shift = interpolated(np.eye(count), angles_of(count) + curve.rotation)
             slope = shift @ derivative(curve.x)
         own, after, by_p, residual = self._linearized(curve, shift @ curve.x)
-        matrix = np.einsum("jab,ji->jaib", after, shift)
-        matrix[np.arange(count), :, np.arange(count)] += own
         by_rotation = np.einsum("jab,jb->ja", after, slope / (self.scale * np.sqrt(count)))
-        blocks = matrix.reshape(total, total), by_rotation.reshape(total, 1)
-        left = np.hstack([*blocks, by_p.reshape(total, len(curve.p))])
-        left = np.vstack([left, *(coefficients for coefficients, _ in conditions)])
+        shared = np.concatenate([by_rotation[:, :, None], by_p], axis=2)
         row = self.pack(curve)
         misses = [coefficients @ row - value for coefficients, value in conditions]
-        right = np.append(residual.ravel(), misses)
-        if not (np.isfinite(left).all() and np.isfinite(right).all()):
+        # Right sides: of Newton's correction, and of the tangent.
+        right = np.stack([-residual, 0 * residual], axis=2)
+        values = np.stack([-np.array(misses), np.eye(len(misses))[-1]], axis=1)
+        left = np.stack([coefficients for coefficients, _ in conditions])
+        if not all(np.isfinite(a).all() for a in (own, after, shared, right, left, values)):
             return None
         try:
-            moves = np.linalg.solve(left, np.stack([-right, np.eye(len(right))[-1]], axis=1)).T
+            moves = _solve_bordered(own, after, shift, shared, left, right, values).T
         except np.linalg.LinAlgError:
             return None
         return moves if np.isfinite(moves).all() else None

@@ -28,7 +28,7 @@ from ..machine import (
     nearest_images,
     without_modes,
 )
-from ..orbit import QUASIPERIODIC, WANDERS, agreement, rotation_number, without_angles
+from ..orbit import QUASIPERIODIC, WANDERS, agreement, checked_rotation_number, without_angles
 from ._lyapunov import lyapunov, observe_growth
 
 # The largest difference of sections a period apart; its factor for the least period, if some period
@@ -365,9 +365,13 @@ class Rotation(AbstractMeasure):
     and to less than four on chaotic ones; the error of the rotation number is then some 1e-9. The
     number is that of turns around the mean of the sections, from 0 to 1/2, as ρ and 1 - ρ are the
     same curve. It is NaN for a fixed point, and where averages agree to less than 3.5 digits, as on
-    chaotic motions. A motion that slowly settles on a periodic one has many digits: `Regime`
-    examines its exponent too. Components that stand still, to the accuracy of the method, do not
-    count.
+    chaotic motions. It is NaN also if for some q ≤ 12 every q-th section does not turn q times as
+    far, to 0.02: on several closed curves that the sections visit in turn, as beyond a
+    Neimark–Sacker point of a motion of period q; on a curve that does not wind once around its
+    mean; and sometimes close to a resonance. `find_torus` with the number of `cycles` gives the
+    rotation number of several curves. A motion that slowly settles on a periodic one has many
+    digits: `Regime` examines its exponent too. Components that stand still, to the accuracy of the
+    method, do not count.
 
     **Arguments:** `cycles`, the number of observed cycles; static.
     """
@@ -380,7 +384,7 @@ class Rotation(AbstractMeasure):
         "rotation": {
             "units": "turn/cycle",
             "long_name": "rotation number",
-            "comment": f"NaN for a fixed point, and with less than {_FEW} digits",
+            "comment": f"NaN for a fixed point, with less than {_FEW} digits, or on several curves",
         },
         "digits": {"units": "1", "long_name": "digits to which averages of both halves agree"},
     }
@@ -398,7 +402,7 @@ class Rotation(AbstractMeasure):
         sizes = row_sizes(machine, first, rows)
         rows = without_angles(rows, sizes, angles_in(machine, first))
         digits = agreement(rows, self.wander)
-        turns = rotation_number(rows, self.wander)
+        turns = checked_rotation_number(rows, self.wander)
         return {"rotation": jnp.where(digits < _FEW, jnp.nan, turns), "digits": digits}
 
 
