@@ -87,7 +87,7 @@ def test_basins_as_data(found):
 def test_invalid_regions_raise():
     with pytest.raises(ValueError, match="ranges"):
         vi.basins(SCENE, {"start.Y": (1.0, -1.0)})
-    with pytest.raises(ValueError, match="parts of the start"):
+    with pytest.raises(ValueError, match="numbers of the start"):
         vi.basins(SCENE, {"drive.frequency_ratio": (0.5, 1.0)})
     with pytest.raises(ValueError, match="one number or 2"):
         vi.basins(SCENE, REGION, resolution=(3, 3, 3))
