@@ -75,9 +75,12 @@ def test_a_curve_ends_where_another_segment_vanishes():
     curve = vi.boundary(point, parameter="damping", bounds=(bounds, (0.05, 0.15)), progress=False)
     assert curve.kind == "grazing-sliding" and curve.ends == ("crossing-sliding", "bounds")
     level, damping = curve.parameters[0]
-    branch = branch_of("level", (0.05, 0.16), level=0.15, damping=damping, **numbers)
-    assert branch.special[0].kind == "crossing-sliding"
-    assert branch.special[0].parameter == pytest.approx(level, abs=1e-8)
+    first = {}
+    for change in (-1e-4, 0.0, 1e-4):
+        given = dict(level=0.15, damping=damping + change, **numbers)
+        first[change] = branch_of("level", (0.05, 0.16), **given).special[0]
+    assert first[0.0].parameter == pytest.approx(level, abs=1e-8)  # where both kinds meet
+    assert first[-1e-4].kind == "crossing-sliding" and first[1e-4].kind == "grazing-sliding"
 
 
 def test_a_motion_that_ceases():

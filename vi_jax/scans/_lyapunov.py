@@ -463,7 +463,7 @@ def _orthonormalize(
 ) -> tuple[Float[Array, "states number"], Float[Array, " number"]]:
     """Return the frame made orthonormal (Gram and Schmidt, twice), and its lengths before that."""
 
-    def orthogonal(basis: Array, given: tuple[Scalar, Array]) -> tuple[Array, Scalar]:
+    def orthogonal(basis: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
         k, column = given
         before = _length(column)
         for _ in range(2):
