@@ -39,6 +39,10 @@ def test_the_script_reproduces_the_page(name):
         # Rounding differs between machines: allow two units of the last digit, or a zero's bound.
         zero = float(theirs) == 0
         slack = number.allowed if zero else 2 * last_digit(ours)
+        if name == "duffing_basins":
+            # Rounding decides where starts near fractal boundaries go: with AVX2 39 of 10,000 go
+            # elsewhere than with AVX-512.
+            slack = max(slack, 0.2 * number.allowed)
         assert abs(float(ours) - float(number.ours)) <= slack, quantity
         assert float(difference) <= number.allowed * 1.1, quantity  # printed with one digit
         size = 10.0 ** floor(log10(float(difference) or 1e-300))

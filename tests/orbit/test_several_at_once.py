@@ -186,7 +186,9 @@ def test_a_fold_and_a_branch_point_in_one_step():
     places = [point.parameter for point in branch.special]
     np.testing.assert_allclose(places, [0.005**2, 0.0], atol=1e-12)
     begun = vi.continue_orbit(branch.special[1].orbit, **options)
-    assert [point.kind for point in begun.special] == ["branch-point"]
+    # Rounding decides whether the fold at its own start is listed: it is with AVX2.
+    later = [point for point in begun.special if abs(point.parameter) > 1e-12]
+    assert [point.kind for point in later] == ["branch-point"]
 
 
 def test_a_curve_of_touches_ends_where_the_other_stop_is_touched():
