@@ -508,8 +508,8 @@ def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:
 
 
 def _substituted(rows: Matrix, ratios: Matrix, inverses: list[Any], right: list[Any]) -> list[Any]:
-    """Return the solution for a right side from the results of `_eliminated`."""
-    n, right = len(rows), list(right)
+    """Return the solution for a right side, which changes, from the results of `_eliminated`."""
+    n = len(rows)
     for i in range(n):
         for k in range(i + 1, n):
             right[k] = _minus_product(right[k], ratios[k][i], right[i])

@@ -183,11 +183,16 @@ def solve_modes(matrix: Array, right: Array) -> Array:
     return jnp.sum(jnp.where(place[None, :] == rows[:, None], table[None, :, -1], 0.0), 1)
 
 
+def _diagonal(matrix: Array) -> Array:
+    """Return the diagonal; vector code runs."""
+    return jnp.sum(matrix * np.eye(len(matrix)), 1)
+
+
 def _scaled(x: Contacts) -> tuple[Contacts, Array, Array]:
     """Return the question with rows in units of their gain, and rates in units of the largest; the
     units of the rows; and that of the rates."""
     n, t = x.closed.shape[0], x.friction.shape[0]
-    own = jnp.sum(x.gains * np.eye(x.rates.shape[0]), 1)
+    own = _diagonal(x.gains)
     unit = 1 / jnp.sqrt(jnp.where(own > 0, own, 1.0))
     top = jnp.maximum(jnp.max(jnp.abs(x.rates * unit)), float(jnp.finfo(unit.dtype).tiny))
     if x.level.shape[0]:
@@ -290,7 +295,7 @@ def _redundant(gains: Array, first: Array, still: Array) -> Array:
     """Return which rows depend linearly on the `first` ones, or are `still` and depend on these
     and on one before that is still, too."""
     gains, rows = stop_gradient(gains), np.arange(gains.shape[0])
-    own = jnp.sum(gains * np.eye(len(rows)), 1)
+    own = _diagonal(gains)
     zeros, least = jnp.zeros((len(rows),), gains.dtype), _share(_REDUNDANT, gains) * own
     takes = jnp.stack([first, still])
 
@@ -305,7 +310,7 @@ def _redundant(gains: Array, first: Array, still: Array) -> Array:
         change = column[:, None] * jnp.sum(jnp.where(here[:, None], table, 0.0), 0)
         change = change / jnp.where(any_counts, pivot, 1.0)
         table = jnp.where(any_counts, table - change, table)
-        return (table, jnp.where(counts, 1.0, found)), jnp.sum(table * np.eye(len(rows)), 1)
+        return (table, jnp.where(counts, 1.0, found)), _diagonal(table)
 
     order = np.tile(rows, 2) * 1.0, jnp.repeat(takes, len(rows), 0)
     carry, left = jax.lax.scan(step, (gains, zeros), order)
@@ -339,7 +344,7 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
     if n > 1 or x.slip.shape[0] > 1:
         pushes, acts, t = found.pushes, found.holds, len(of)
         if n:  # a contact that is about to open is not pushed, but for rounding
-            own = jnp.sum(x.gains * np.eye(rate.shape[0]), 1)[:n]
+            own = _diagonal(x.gains)[:n]
             pushes = pushes & (own * found.force[:n] > _share(_OPENS, rate) * size)
         if of:  # a contact that is not pushed has no friction
             on = _normals(x, of)[:t] @ jnp.where(pushes, 1.0, jnp.zeros_like(rate[:n]))
@@ -363,7 +368,7 @@ def _decide_quickly(x: Contacts) -> _Decided:
     that may, or all but one, which opens or begins to slip. Other cases and ties are left to
     Lemke's method, which took as long as all of the step at each event of two frictions."""
     n, free, bound = x.closed.shape[0], x.slip == 0, x.hold * x.level
-    own = jnp.sum(x.gains * np.eye(x.rates.shape[0]), 1)[:n]
+    own = _diagonal(x.gains)[:n]
 
     def compare(force: Array, largest: Array) -> tuple[Array, Array]:
         tie = _tie(force) * (largest + jnp.max(jnp.abs(force)))
@@ -414,7 +419,7 @@ def _decide_in_turn(x: Contacts, of: tuple[int, ...], has_ratios: bool) -> _Deci
     if not has_ratios:
         return _decide(x, of)
     n, rows = x.closed.shape[0], np.arange(x.slip.shape[0])
-    own = jnp.sum(x.gains * np.eye(x.rates.shape[0]), 1)[n:]
+    own = _diagonal(x.gains)[n:]
 
     def ask(state: tuple) -> tuple:
         slip, _, _, count = state

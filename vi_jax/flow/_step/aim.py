@@ -521,12 +521,12 @@ def _next_goal(plan: Plan, lane: Lane, trial: Trial, found: _Found) -> tuple[Fla
             # An event may have come before the one that was met: step to the force's extremum.
             hidden, place = found.windows[k]
             goal = goal.cut(hidden & ~met, place)
-            left, released, place, *_ = path.near.release
+            release = path.near.release
             goal = _Goal(
-                event=goal.event & ~released | left,
-                before=goal.before & ~left,
-                length=jnp.where(left, place, goal.length),
-                target=jnp.where(left, to_release(k), goal.target),
+                event=goal.event & ~release.landed | release.left,
+                before=goal.before & ~release.left,
+                length=jnp.where(release.left, release.place, goal.length),
+                target=jnp.where(release.left, to_release(k), goal.target),
             )
     for above, place in reversed(found.rises):
         goal = goal.cut(above & ~goal.event, place)
@@ -549,7 +549,7 @@ def _find_events(plan: Plan, lane: Lane, trial: Trial) -> _Found:
     eps = float(jnp.finfo(h.dtype).eps)
     for k, path in enumerate(trial.paths):
         if path.near is not None:
-            left, landed, *_ = path.near.release
+            left, landed = path.near.release.left, path.near.release.landed
             hidden, place = force_may_turn(lane, k, path, h)
             windows[k] = good & hidden, place
             if path.pull is not None and path.pull.is_used is not None:

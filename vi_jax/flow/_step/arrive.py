@@ -10,7 +10,6 @@ from ..._types import Flag, Scalar, Scalars, State
 from ...machine import (
     AbstractEvent,
     AbstractMachine,
-    DryFriction,
     after_event,
     chosen_stop,
     constant_modes,
@@ -694,9 +693,9 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
 
 
 def _slips_change(machine: AbstractMachine, s: Scalar, before: State, after: State) -> Flag:
-    """Return whether an impact changes the slip of a dry friction at all."""
-    dry = [x for x in switches_of(machine) if isinstance(x, DryFriction)]
-    pairs = ([x.speed_of_slip(machine, s, state) for state in (before, after)] for x in dry)
+    """Return whether an impact changes the slip of a friction at all."""
+    frictions = [switches_of(machine)[i] for i in frictions_in(machine)]
+    pairs = ([x.speed_of_slip(machine, s, state) for state in (before, after)] for x in frictions)
     return stop_gradient(any_of(jnp.zeros((), bool), (old != new for old, new in pairs)))
 
 

@@ -478,11 +478,12 @@ def _hold_resting(
         time = jnp.where(ends, times[k], 0.0)
         wait = time if len(rests) == 1 else jnp.maximum(wait, time)
         contact = with_item(contact, k, jnp.where(ends, impacts[k].contact, contact[k]))
-    contacts, given = {k: impact.contact for k, impact in impacts.items()}, modes
-    modes = lane.modes if given is None else given
-    if has_contact_friction(plan.machine):
-        if given is None:  # the direction of slip is known after the impact
+    contacts = {k: impact.contact for k, impact in impacts.items()}
+    if modes is None:
+        modes = lane.modes
+        if has_contact_friction(plan.machine):  # the direction of slip is known after the impact
             modes = struck_modes(plan.machine, s, state, modes, contact=contact, before=at_event)
+    if has_contact_friction(plan.machine):
         slowed, rebound_energy = _without_rebounds(plan, s, state, modes, rests, contacts)
         still, lost = stop_bodies(plan, s, slowed, rests, contacts)
         lost = lost + rebound_energy
