@@ -28,6 +28,7 @@ from .delay import (
     recorded_numbers, with_some_past, without_past,
 )
 from .delay_chain import delay_chain, history_in, machine_of_chain, without_history
+from .elimination import is_definite, solved
 from .event import AbstractEvent, AbstractSwitch
 from .events import (
     Reset, Switch, after_event, begin_modes, event_of, events_of_steps, guard_of,
@@ -42,7 +43,7 @@ from .leaves import (
     by_name, check_again, check_leaf, check_name, components, first_few, in_rows, leaf, leaf_names,
     near_names, size_by, size_of, with_leaf, with_leaves,
 )
-from .mechanical import Mechanical, is_definite, solved
+from .mechanical import Mechanical
 from .modes import (
     HybridState, begun, constant_modes, history_of, modes_at_start, modes_of, own_modes, raveled,
     replaced, with_modes, without_modes,

@@ -22,6 +22,7 @@ from .._checks import returned
 from .._messages import count_of
 from .._types import Flag, Machine, Scalar, Scalars, State
 from .coordinates import Row
+from .elimination import is_known, solved
 from .parts import friction_on, limited_in, stops_of, switches_of
 from .settle import Strike
 from .state import like
@@ -68,11 +69,6 @@ def push_gains(
     return [[gain(body, row, push) for push in pushes] for body, row in each]
 
 
-def _is(x: Any, value: float) -> bool:
-    """Return whether a number is a Python number equal to `value`, known while tracing."""
-    return isinstance(x, float) and x == value
-
-
 def _product(slopes: State, push: State) -> Any:
     """Return the sum of the products of two trees' numbers, without known zeros."""
     terms = []
@@ -91,36 +87,20 @@ def forces(
     `wanted`, with `gains` from `push_gains`; 0 for the others."""
 
     def entry(j: int, k: int, x: Any) -> Any:
-        if _is(x, 0.0 if j != k else 1.0):
+        if is_known(x, 0.0 if j != k else 1.0):
             return x
         return jnp.where(acting[j], x, 1.0 if j == k else 0.0)
 
     rows = [[entry(j, k, x) for k, x in enumerate(row)] for j, row in enumerate(gains)]
     sides = [jnp.where(on, x, 0.0) for on, x in zip(acting, wanted, strict=True)]
-    return _solved([[*row, x] for row, x in zip(rows, sides, strict=True)])
+    return solved(rows, sides, _inverse_or_zero)
 
 
-def _solved(rows: list[list[Any]]) -> list[Any]:
-    """Solve a small linear system whose last column is the right side. Its matrix, of inverse
-    masses of contacts, needs no pivoting."""
-    n = len(rows)
-    for i in range(n):
-        pivot, later = rows[i][i], [k for k in range(i + 1, n + 1) if not _is(rows[i][k], 0.0)]
-        if not _is(pivot, 1.0):
-            is_independent = jnp.abs(stop_gradient(pivot)) > _REDUNDANT
-            inverse = jnp.where(is_independent, 1 / jnp.where(is_independent, pivot, 1.0), 0.0)
-            for k in later:
-                rows[i][k] = rows[i][k] * inverse
-        for row in rows[i + 1 :]:
-            for k in later if not _is(row[i], 0.0) else ():
-                product = row[i] * rows[i][k]
-                row[k] = -product if _is(row[k], 0.0) else row[k] - product
-    found = [row[-1] for row in rows]
-    for i in reversed(range(n)):
-        for j in range(i):
-            if not _is(rows[j][i], 0.0):
-                found[j] = found[j] - rows[j][i] * found[i]
-    return found
+def _inverse_or_zero(pivot: Any) -> Any:
+    if is_known(pivot, 1.0):
+        return 1.0
+    is_independent = jnp.abs(stop_gradient(pivot)) > _REDUNDANT
+    return jnp.where(is_independent, 1 / jnp.where(is_independent, pivot, 1.0), 0.0)
 
 
 def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> State:
@@ -207,9 +187,9 @@ class ContactConstraints(NamedTuple):
         slips = [(i, x[2], x[3]) for i, x in enumerate(self.stop_frictions, start=first)]
         for i, stop, share in slips:
             for row in gains:
-                if not _is(row[i], 0.0):
-                    change = share if _is(row[i], 1.0) else share * row[i]
-                    row[stop] = change if _is(row[stop], 0.0) else row[stop] + change
+                if not is_known(row[i], 0.0):
+                    change = share if is_known(row[i], 1.0) else share * row[i]
+                    row[stop] = change if is_known(row[stop], 0.0) else row[stop] + change
         amounts = forces(gains, self.acts, wanted)
         for i, stop, share in slips:
             amounts[i] = amounts[i] + share * amounts[stop]

@@ -7,7 +7,6 @@ vᵀ(∂M/∂q_i) v. The force of a contact with gap g(q), J = ∇g, acts along 
 
 import abc
 import functools
-import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import pi
 from typing import Any, ClassVar, NamedTuple
@@ -19,19 +18,17 @@ import numpy as np
 from jax.core import Tracer
 
 from .._checks import concrete, returned
-from .._types import Flag, Scalar, State
+from .._types import Scalar, State
 from ..lanes import dependent_results
 from .base import AbstractMachine, cached_in_trace, contacts_in
 from .contacts import check_takes
 from .coordinates import Coordinate, Row, component
+from .elimination import Matrix, dot, is_known, minus_product, solved, sum_of, times
 from .leaves import split_index
 from .overrides import overridden
 from .state import State as Named
 from .state import like
 from .stop import Wall
-
-# A mass matrix as rows of numbers.
-Matrix = list[list[Any]]
 
 # Errors of the position of a prescribed coordinate decay by exp(-2π), 2e-3, in a cycle. A choice:
 # twice that rate takes 1.5 times as many steps.
@@ -170,10 +167,10 @@ class Mechanical(AbstractMachine):
         applied = like(free, returned(given, whose, what), whose)
         if not isinstance(applied, Named):
             raise TypeError(f"{whose} must return {what}.")
-        known = {x: f for x, f in given.items() if _is_zero(f)} if isinstance(given, dict) else {}
+        known = {x: f for x, f in given.items() if is_known(f)} if isinstance(given, dict) else {}
         applied = vars(applied) | known
         both = zip(applied.values(), self._inertial(q, v), strict=True)
-        net_forces = [_minus_product(f, 1.0, h) for f, h in both]
+        net_forces = [minus_product(f, 1.0, h) for f, h in both]
         rates = dict(zip(names, solved(self._masses(q), net_forces), strict=True))
         if len(names) < len(self._q_names):
             rates |= self._prescribed_accelerations(t, q, v)
@@ -236,10 +233,10 @@ class Mechanical(AbstractMachine):
 
         def momenta(q: Named) -> list[Any]:
             rows = (zip(row, speeds, strict=True) for row in self._masses(q))
-            return [_sum(_times(m, x) for m, x in row if not _is_zero(m)) for row in rows]
+            return [sum_of(times(m, x) for m, x in row if not is_known(m)) for row in rows]
 
         def twice_energy(q: Named) -> Any:
-            return _dot(momenta(q), speeds)
+            return dot(momenta(q), speeds)
 
         for name, acts in _dependence(momenta, q).items():
             if not any(acts):
@@ -248,10 +245,10 @@ class Mechanical(AbstractMachine):
             is_array = jnp.ndim(speed) > 0
             slopes = _rate_along(momenta, q, name, speed if is_array else jnp.ones_like(speed))
             slopes = [x if y else 0.0 for x, y in zip(slopes, acts, strict=True)]
-            pull = _derivative(twice_energy, q, name) if is_array else _dot(slopes, speeds)
+            pull = _derivative(twice_energy, q, name) if is_array else dot(slopes, speeds)
             for x, slope in zip(names, slopes, strict=True):
-                if not _is_zero(slope):
-                    found[x] = _sum((found[x], slope if is_array else slope * speed))
+                if not is_known(slope):
+                    found[x] = sum_of((found[x], slope if is_array else slope * speed))
             if name in found:
                 found[name] = found[name] - 0.5 * pull
         return list(found.values())
@@ -398,13 +395,13 @@ def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any, list[
     by_name = dict(zip(machine._q_names, gradient, strict=True))
     slopes = [by_name[name] for name in names]
     push = solved(machine._masses(q), slopes)
-    gain = _dot(slopes, push)
-    if _is_zero(gain):
+    gain = dot(slopes, push)
+    if is_known(gain):
         raise ValueError(
             f"A contact of a {type(machine).__name__} is `on` no coordinate that it could move. "
             "Its gap must depend on a coordinate that is not prescribed."
         )
-    pushes = {name: 0.0 if _is_zero(x) else x / gain for name, x in zip(names, push, strict=True)}
+    pushes = {name: 0.0 if is_known(x) else x / gain for name, x in zip(names, push, strict=True)}
     return [pushes.get(name, 0.0) for name in machine._q_names], 1 / gain, gradient
 
 
@@ -452,12 +449,7 @@ def _replaced(x: Named, name: str, value: Any) -> Named:
 
 def _moved(x: Named, push: list[Any], amount: Any) -> Named:
     both = zip(vars(x).items(), push, strict=True)
-    return Named(**{name: y if _is_zero(p) else y + p * amount for (name, y), p in both})
-
-
-def _is_zero(x: Any, zero: float = 0.0) -> bool:
-    """Return whether a number is a Python number equal to `zero`, which is known while tracing."""
-    return isinstance(x, int | float) and x == zero
+    return Named(**{name: y if is_known(p) else y + p * amount for (name, y), p in both})
 
 
 def matrix_of(given: Any, shapes: Mapping[str, tuple[int, ...]], whose: str) -> Matrix:
@@ -496,74 +488,3 @@ def matrix_of(given: Any, shapes: Mapping[str, tuple[int, ...]], whose: str) -> 
 
 def _is_mass(x: Any, shape: tuple[int, ...]) -> bool:
     return not isinstance(x, list | tuple) and jnp.shape(x) in ((), shape)
-
-
-def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:
-    """Return M⁻¹ right for a symmetric positive definite matrix, by elimination without pivoting,
-    omitting zeros. Pivots are inverted: those of constant masses do not change in a step."""
-    n = len(M)
-    if n > 2 and any(not _is_zero(M[i][j]) for i in range(n) for j in range(i)):
-        return _substituted_once(*_eliminated_once(M), list(right))
-    return _substituted(*_eliminated(M), list(right))
-
-
-def _substituted(rows: Matrix, ratios: Matrix, inverses: list[Any], right: list[Any]) -> list[Any]:
-    """Return the solution for a right side, which changes, from the results of `_eliminated`."""
-    n = len(rows)
-    for i in range(n):
-        for k in range(i + 1, n):
-            right[k] = _minus_product(right[k], ratios[k][i], right[i])
-    found: list[Any] = [0.0] * n
-    for i in reversed(range(n)):
-        value = right[i]
-        for j in range(i + 1, n):
-            value = _minus_product(value, rows[i][j], found[j])
-        found[i] = 0.0 if _is_zero(value) else _times(inverses[i], value)
-    return found
-
-
-def is_definite(M: Matrix) -> Flag:
-    """Return whether a symmetric matrix is positive definite, by the pivots of elimination."""
-    flags = [jnp.all(jnp.asarray(x) > 0) for x in _eliminated(M)[2]]
-    return functools.reduce(operator.and_, flags)
-
-
-def _eliminated(M: Matrix) -> tuple[Matrix, Matrix, list[Any]]:
-    """Return the rows of a matrix after elimination, the ratios by which rows were subtracted, and
-    the inverse pivots."""
-    n, rows, inverses = len(M), [list(row) for row in M], []
-    ratios = [[0.0] * n for _ in M]
-    for i in range(n):
-        inverses.append(1 / rows[i][i])
-        for k in range(i + 1, n):
-            if _is_zero(rows[k][i]):
-                continue
-            ratios[k][i] = ratio = rows[k][i] * inverses[i]
-            rows[k] = [_minus_product(a, ratio, b) for a, b in zip(rows[k], rows[i], strict=True)]
-    return rows, ratios, inverses
-
-
-# Traced once for all contacts and states, and written inline, where constant masses are eliminated
-# once. 12 bodies with a full matrix took 18 s to trace.
-_eliminated_once = eqx.filter_jit(_eliminated, inline=True)  # pyright: ignore
-_substituted_once = eqx.filter_jit(_substituted, inline=True)  # pyright: ignore
-
-
-def _minus_product(x: Any, factor: Any, y: Any) -> Any:
-    """Return x - factor·y, without known zeros."""
-    return x if _is_zero(factor) or _is_zero(y) else x - _times(factor, y)
-
-
-def _dot(xs: Sequence[Any], ys: Sequence[Any]) -> Any:
-    """Return the sum of the products of numbers and arrays, without known zeros."""
-    both = [(x, y) for x, y in zip(xs, ys, strict=True) if not _is_zero(x)]
-    return _sum(jnp.sum(x * y) if jnp.ndim(x) else x * y for x, y in both)
-
-
-def _sum(xs: Iterable[Any]) -> Any:
-    """Return a sum without known zeros: the compiler must not omit an addition of 0."""
-    return functools.reduce(operator.add, [x for x in xs if not _is_zero(x)] or [0.0])
-
-
-def _times(factor: Any, y: Any) -> Any:
-    return y if _is_zero(factor, 1.0) else factor * y
