@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.optimize import brentq
 
 
 class Chatters(Exception):
@@ -24,7 +25,7 @@ class LinearTruth:
 
     The state is (x, v, 1, cos ωs, sin ωs), so that the flow is linear. Gaps are checked at both
     ends of each step (1/40 of the fastest period) and at their extremum in it. Events are found by
-    bisection. A contact without restitution rests on its stop until its force changes sign."""
+    bisection, or by Brent's method. A contact without restitution rests on its stop until its force changes sign."""
 
     def __init__(self, matrices, loads, frequency, contacts, most=60):
         mass, damping, stiffness = (np.asarray(x, float) for x in matrices)
@@ -72,10 +73,16 @@ class LinearTruth:
 
     def first_zero(self, resting, z, length, function):
         """Return a time at which a function of the state changes from negative to positive."""
+        value = lambda t: function(expm(self.held(resting) * t) @ z)
         low, high = 0.0, length
-        for _ in range(52):
-            middle = 0.5 * (low + high)
-            if function(expm(self.held(resting) * middle) @ z) > 0:
+        if value(low) < 0 < value(high):  # a few roundings wide, as after 48 bisections
+            width = 4e-15 * length
+            root = brentq(value, low, high, xtol=width / 4, rtol=1e-15)
+            low, high = max(root - width, low), min(root + width, high)
+            if not value(low) <= 0 < value(high):
+                low, high = 0.0, length
+        while low < (middle := 0.5 * (low + high)) < high and high - low > 2e-16 * length:
+            if value(middle) > 0:
                 high = middle
             else:
                 low = middle
@@ -99,7 +106,7 @@ class LinearTruth:
             reach = length
             if self.speed(i, z) > 0 > self.speed(i, end):  # the gap has an extremum in the step
                 reach = self.first_zero(resting, z, length, lambda y, i=i: -self.speed(i, y))
-            top = expm(self.held(resting) * reach) @ z
+            top = end if reach == length else expm(self.held(resting) * reach) @ z
             if self.depth(i, top) > 1e-13 and self.speed(i, top) > -1e-9:
                 found.append(
                     (self.first_zero(resting, z, reach, lambda y, i=i: self.depth(i, y)), i)
