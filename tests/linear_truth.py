@@ -25,7 +25,8 @@ class LinearTruth:
 
     The state is (x, v, 1, cos ωs, sin ωs), so that the flow is linear. Gaps are checked at both
     ends of each step (1/40 of the fastest period) and at their extremum in it. Events are found by
-    bisection, or by Brent's method. A contact without restitution rests on its stop until its force changes sign."""
+    Brent's method or bisection. A contact without restitution rests on its stop until its force
+    changes sign."""
 
     def __init__(self, matrices, loads, frequency, contacts, most=60):
         mass, damping, stiffness = (np.asarray(x, float) for x in matrices)

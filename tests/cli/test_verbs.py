@@ -346,15 +346,10 @@ def test_simulate_and_pictures(run, held):
 
 
 @pytest.mark.slow
-def test_all_other_verbs(run, held):
+def test_scan_and_orbit_with_a_delay(run, held):
     head, picture = f"machine = '{held}'\n", "settle = 20\npicture = 'p.png'\n"
     axes = "[scan.axes]\ngain = [0.2, 0.3]\ndelay = [1.0, 4.0]"
     assert "period 1 cycle: 4" in run("scan", f"{head}[scan]\n{picture}{axes}")
-    values = "parameter = 'gain'\nvalues = [0.2, 0.3]\n"
-    assert "1 cycle with 1 impact" in run("sweep", f"{head}[sweep]\n{values}{picture}")
-    region = "[basins.region]\n'start.x' = [-0.5, 0.5]\n'start.u' = [-0.5, 0.5]"
-    text = f"{head}[basins]\nresolution = 3\n{picture}{region}"
-    assert "1 periodic motion" in run("basins", text)
     text = f"{head}[orbit]\n{picture}"
     assert "a run with the whole history differs by" in run("orbit", text)
 
