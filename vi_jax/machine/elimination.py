@@ -39,43 +39,38 @@ def solved(
     return _substituted(*_eliminated(M, inverse), list(right))
 
 
-def _substituted(rows: Matrix, ratios: Matrix, inverses: list[Any], right: list[Any]) -> list[Any]:
+def _substituted(rows: Matrix, inverses: list[Any], right: list[Any]) -> list[Any]:
     """Return the solution for a right side, which changes, from the results of `_eliminated`."""
     n = len(rows)
     for i in range(n):
+        right[i] = times(inverses[i], right[i])
         for k in range(i + 1, n):
-            right[k] = minus_product(right[k], ratios[k][i], right[i])
-    found: list[Any] = [0.0] * n
+            right[k] = minus_product(right[k], rows[k][i], right[i])
     for i in reversed(range(n)):
-        value = right[i]
-        for j in range(i + 1, n):
-            value = minus_product(value, rows[i][j], found[j])
-        found[i] = 0.0 if is_known(value) else times(inverses[i], value)
-    return found
+        for j in reversed(range(i + 1, n)):
+            right[i] = minus_product(right[i], rows[i][j], right[j])
+    return right
 
 
 def is_definite(M: Matrix) -> Flag:
     """Return whether a symmetric matrix is positive definite, by the pivots of elimination."""
-    flags = [jnp.all(jnp.asarray(x) > 0) for x in _eliminated(M)[2]]
+    flags = [jnp.all(jnp.asarray(x) > 0) for x in _eliminated(M)[1]]
     return functools.reduce(operator.and_, flags)
 
 
 def _eliminated(
     M: Matrix, inverse: Callable[[Any], Any] = _inverse
-) -> tuple[Matrix, Matrix, list[Any]]:  # fmt: skip
-    """Return the rows of a matrix after elimination, the ratios by which rows were subtracted, and
-    the inverse pivots."""
+) -> tuple[Matrix, list[Any]]:  # fmt: skip
+    """Return the factors of a matrix in one: the lower one, and above its diagonal the upper one,
+    whose diagonal is 1; and the inverse pivots."""
     n, rows, inverses = len(M), [list(row) for row in M], []
-    ratios = [[0.0] * n for _ in M]
     for i in range(n):
         inverses.append(inverse(rows[i][i]))
-        for k in range(i + 1, n):
-            if is_known(rows[k][i]):
-                continue
-            ratios[k][i] = ratio = times(inverses[i], rows[k][i])
-            for j in range(i + 1, n):
-                rows[k][j] = minus_product(rows[k][j], ratio, rows[i][j])
-    return rows, ratios, inverses
+        for j in range(i + 1, n):
+            rows[i][j] = times(inverses[i], rows[i][j])
+            for k in range(i + 1, n):
+                rows[k][j] = minus_product(rows[k][j], rows[k][i], rows[i][j])
+    return rows, inverses
 
 
 # Traced once for all contacts and states, and written inline, where constant masses are eliminated
@@ -85,7 +80,7 @@ _substituted_once = eqx.filter_jit(_substituted, inline=True)  # pyright: ignore
 
 
 def minus_product(x: Any, factor: Any, y: Any) -> Any:
-    """Return x - factor·y, without known zeros."""
+    """Return x - factor·y, without known zeros and ones."""
     return x if is_known(factor) or is_known(y) else x - times(factor, y)
 
 
@@ -101,4 +96,5 @@ def sum_of(xs: Iterable[Any]) -> Any:
 
 
 def times(factor: Any, y: Any) -> Any:
-    return y if is_known(factor, 1.0) else factor * y
+    """Return factor·y, without known zeros and ones."""
+    return y if is_known(factor, 1.0) or is_known(y) else factor * y
