@@ -75,11 +75,6 @@ _LONG = 4.0
 # The description of a branch point at which this branch begins.
 _BEGINS = "a multiplier touches 1: this branch begins at another one, on both sides"
 
-# Before a lost impact tests are taken at the first of these shares of the step with multipliers below
-# the second number, so that their products are no rounding: at 5e4 these had errors of 1, and a
-# Neimark–Sacker point was missed.
-_POLES, _LARGE = (LOCATED, 1e-5, 1e-4), 1e4
-
 # Most halvings of a step to separate bifurcations in it: a 100,000th of it is left.
 _MOST_HALVINGS = 17
 
@@ -209,12 +204,8 @@ class MotionTable(Table):
             return self._end_with(GRAZING, at, detail)
         # At a lost impact a multiplier goes to infinity and returns from the other side. Its sign
         # is that of rounding, and the tests for bifurcations may have changed sign twice.
-        before_pole = at
-        for share in _POLES:
-            step = self._partway(here, at, 1 - share)
-            before_pole = step if bool(step.good) else before_pole
-            if np.abs(before_pole.observed.multipliers).max() < _LARGE:
-                break
+        before_pole = self._partway(here, at, 1 - LOCATED)
+        before_pole = before_pole if bool(before_pole.good) else at
         M, values = before_pole.observed.monodromy, before_pole.observed.multipliers
         at = at._replace(observed=at.observed._replace(monodromy=M, multipliers=values))
         return self._end_with(GRAZING, at, detail, impact)._replace(until=before_pole)
