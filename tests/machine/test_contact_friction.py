@@ -132,3 +132,40 @@ def test_an_impact_that_would_gain_energy_is_counted():
     gains = np.linalg.inv(machine.mass(None))
     push = [float(run.impact_log.drag[0, 0]), float(run.impact_log.impulse[0, 0])]
     np.testing.assert_allclose(gains @ push, [1.230800893, 1.801749409], atol=1e-9)
+
+
+class Pressed(vi.Mechanical):
+    """A body that rubs on a wall and on a floor, on which a spring presses more to the left."""
+
+    q = ("x", "y")
+    mass = (1.0, 2.0)
+    cycle = 2 * jnp.pi / 0.8
+    contacts = (
+        vi.RigidStop(0.0, 0.4, "left", on="y", friction=0.3, along="x"),
+        vi.DryFriction(0.05, on="x"),
+    )
+
+    def force(self, t, q, v):
+        link = 0.5 * (q.x - q.y)
+        return dict(x=jnp.cos(0.8 * t) - q.x - 0.1 * v.x - link, y=link - 1.0 - q.x)
+
+
+class PressedByLaw(vi.Mechanical):
+    """The same as a body that rubs once."""
+
+    q = "x"
+    mass = 1.0
+    cycle = Pressed.cycle
+    contacts = vi.DryFriction(1.0, on="x", load=lambda z: 0.05 + 0.3 * (1 + 0.5 * z.x))
+
+    def force(self, t, q, v):
+        return dict(x=jnp.cos(0.8 * t) - 1.5 * q.x - 0.1 * v.x)
+
+
+def test_friction_on_a_stop_and_dry_friction_release_a_body_together():
+    """Once each released the body to the other at the same instant, without end."""
+    pair, one = Pressed(), PressedByLaw()
+    run = vi.simulate(pair, pair.at(x=0.2), 2)
+    other = vi.simulate(one, one.at(x=0.2), 2)
+    np.testing.assert_allclose(run.sections.x, other.sections.x, atol=1e-10)
+    np.testing.assert_allclose(run.sections.v.x, other.sections.v.x, atol=1e-10)

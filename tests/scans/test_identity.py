@@ -43,6 +43,8 @@ class Depth(vi.AbstractMeasure):
 
 class Ball(vi.AbstractMachine):
     cycle: float = 1.0
+    contacts = (vi.RigidStop(3.0, 0.8), vi.DryFriction(lambda speed: 0.1, on="V"))
+    scales = {"V": jnp.array([1.0, 7.0])}
 
     def field(self, s, state):
         return vi.OscillatorState(state.V, -9.81)
@@ -86,7 +88,10 @@ MEASURES = {"measure", "compiled", "filtered", "mapped", "partial"}
     [
         ("FACTOR = 2.0", "FACTOR = 2.0  # unit: a", set()), ("power=2)", "power=3)", MEASURES),
         ("maker(offset):\n", "maker(offset):\n    offset = 2 * offset\n", {"closure"}),
-        ("-9.81", "-9.82", {"scene"}), ("self.gain = 1.5", "self.gain = 1.6", {"object"}),
+        ("FACTOR = 2.0", "FACTOR = 2.0\ngain = 5.0  # not the attribute", set()),
+        ("-9.81", "-9.82", {"scene"}), ("Stop(3.0", "Stop(3.1", {"scene"}),
+        ("speed: 0.1", "speed: 0.2", {"scene"}), ("1.0, 7.0", "1.0, 8.0", {"scene"}),
+        ("self.gain = 1.5", "self.gain = 1.6", {"object"}),
         ('return {"depth": self.scaled', 'return {"deep": self.scaled', {"module"}),
         ("power: float = 2.0", "power: float = 3.0", {"module"}),
         ("FACTOR = 2.0", "FACTOR = 3.0", {*MEASURES, "lambda", "module"}),

@@ -503,13 +503,16 @@ def _slips(
     slipping body; jitted like `_solve_forces`. `begins`: after events of frictions, whether it
     begins to slip."""
     slips, holds, flow = [], [], field_in(machine, s, state, modes)
+    any_begins = functools.reduce(jnp.logical_or, begins or (), jnp.zeros((), bool))
     for n, i in enumerate(frictions_in(machine)):
         friction = switches_of(machine)[i]
         ratio = friction.static_share(machine, s, state)
         slip = friction.slip_sign(machine, s, state, flow)
         if begins is not None:  # the slip of a sticking body is rounding
             slip = jnp.where(jnp.abs(modes[i]) < 1, 0.0, slip)
-            ratio = jnp.where(begins[n], 1 - released_share(slip), ratio)
+            # A redundant friction does not hold what another releases.
+            is_spare = (modes[i] != 0) & (jnp.abs(modes[i]) < 1) & any_begins
+            ratio = jnp.where(begins[n] | is_spare, 1 - released_share(slip), ratio)
         slips.append(slip)
         holds.append(ratio + jnp.zeros_like(s))
     return tuple(slips), tuple(holds)

@@ -1,6 +1,7 @@
 """Storage of a scan's results, as arrays in memory or as a Zarr store that survives interruption;
 and the description of a scan, by which a store recognizes it."""
 
+import dis
 import functools
 import hashlib
 import inspect
@@ -384,6 +385,9 @@ _LIBRARIES = {
     "lineax", "jaxtyping", "beartype", "xarray", "matplotlib", *sys.stdlib_module_names,
 }  # fmt: skip
 
+# Instructions that read a global: within a class body, names may be globals, too.
+_LOADS = {"LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS"}
+
 # Members of a class that its author did not write.
 _GENERATED = (types.GetSetDescriptorType, types.MemberDescriptorType, types.WrapperDescriptorType)
 
@@ -447,7 +451,8 @@ def _parts(thing: Any) -> list[Any]:
             raise OSError("it was made by `exec`")
         source = inspect.getsource(thing)
         named = _named(thing.__code__)
-        known = {n: thing.__globals__[n] for n in sorted(named) if n in thing.__globals__}
+        loaded = sorted(_globals_of(thing.__code__) & {*thing.__globals__})
+        known = {n: thing.__globals__[n] for n in loaded}
         known |= {n: sys.modules[n] for n in sorted(named - {*known}) if n in sys.modules}
         modules = [
             x for x in (*known.values(), *nonlocals.values()) if isinstance(x, types.ModuleType)
@@ -467,6 +472,13 @@ def _named(code: types.CodeType) -> set[str]:
     return {*code.co_names}.union(*map(_named, inner))
 
 
+def _globals_of(code: types.CodeType) -> set[str]:
+    """Return the names of the globals that a function reads. The names of attributes are others."""
+    inner = (x for x in code.co_consts if isinstance(x, types.CodeType))
+    loads = {x.argval for x in dis.get_instructions(code) if x.opname in _LOADS}
+    return loads.union(*map(_globals_of, inner))
+
+
 def _members_of_modules(modules: list[types.ModuleType], named: set[str]) -> Iterator[Any]:
     """Yield the members that a function may read from a user's modules, with their names."""
     modules, visited = list(modules), set[int]()
@@ -482,12 +494,12 @@ def _members_of_modules(modules: list[types.ModuleType], named: set[str]) -> Ite
 
 
 def _members(kind: type) -> Iterator[Any]:
-    """Yield the methods and plain values that the author of a class wrote, with their names."""
+    """Yield the methods and values that the author of a class wrote, with their names."""
     for name, value in sorted(vars(kind).items()):
         code = getattr(inspect.unwrap(value) if callable(value) else value, "__code__", None)
         is_generated = isinstance(value, _GENERATED) or (code and code.co_filename == "<string>")
-        is_plain = isinstance(value, int | float | complex | str | bytes) and name[:2] != "__"
-        if (hasattr(value, "__get__") and not is_generated) or is_plain:
+        is_value = not hasattr(value, "__get__") and name[:2] != "__" and name != "_abc_impl"
+        if (hasattr(value, "__get__") and not is_generated) or is_value:
             yield from (name, value)
 
 
