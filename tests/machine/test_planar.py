@@ -139,7 +139,8 @@ class Table(Box):
 def test_a_table_comes_to_rest():
     """If it falls flat, its spare leg rests when the others do: tested one by one, none of the legs
     was pressed on while the others were held. If it falls obliquely, its legs strike in turn: those
-    whose hops are over rest, though another one is about to strike."""
+    whose hops are over rest, though another one is about to strike. A leg below the centre could
+    carry the table alone, so that the others never came to rest."""
 
     def run(restitution, middle, inertia, tilt):
         table = Table(0.5, restitution, middle, inertia)
@@ -149,7 +150,7 @@ def test_a_table_comes_to_rest():
 
     shares, tilts = jnp.array([0.0, 0.3, 0.5, 0.7]), jnp.tile(jnp.linspace(0.01, 0.2, 10), 2)
     flat = shares, 0 * shares, 0 * shares + 1 / 6, 0 * shares
-    kinds = (jnp.repeat(jnp.array(x), 10) for x in ((0.3, 0.7), (0.2, 0.2), (0.4, 0.6)))
+    kinds = (jnp.repeat(jnp.array(x), 10) for x in ((0.3, 0.7), (0.2, 0.0), (0.4, 0.6)))
     lanes = (jnp.concatenate(x) for x in zip(flat, (*kinds, tilts), strict=True))
     last, good, rests = jax.vmap(run)(*lanes)
     assert bool(good.all()) and bool((rests[:4] > 0).all())

@@ -240,7 +240,8 @@ def test_a_rod_strikes_the_ground_with_much_friction():
 
 def test_a_foot_that_others_hold_is_spare():
     """Feet of a body in a row, in any order, with the load between two of them: only these push. A
-    load beyond the last one opens the others."""
+    load on the middle one is carried by the others: it could carry them alone, but then nothing
+    would hold these. A load beyond the last one opens the others."""
 
     def question(places, load):
         rows = [[0, 1, x] for x in places] + [[1, 0, 1]] * len(places)
@@ -252,6 +253,11 @@ def test_a_foot_that_others_hold_is_spare():
     for answer in found:
         assert answer.kept[:3].all() and answer.spare[:3].sum() == 1
         assert (answer.spare[:3] == (answer.force[:3] == 0)).all()
+    middle = each(ANSWER, [question(x, 0.1) for x in orders])
+    for places, answer in zip(orders, middle, strict=True):
+        assert answer.kept[:3].all() and (answer.spare[:3] == (np.array(places) == 0.1)).all()
+        shares = np.interp(places, (-0.4, 0.1, 0.4), (0.375, 0, 0.625))
+        np.testing.assert_allclose(answer.force[:3], 9.81 * shares, atol=1e-12)
     over = each(ANSWER, [question(x, 0.6) for x in orders])
     for places, answer in zip(orders, over, strict=True):
         assert (answer.kept[:3] == (np.array(places) == 0.4)).all() and not answer.spare.any()

@@ -40,6 +40,11 @@ _OPENS = 1e-9
 # the largest one to the accuracy of the event, which this share exceeds. A choice.
 _RELEASED = 1e-6
 
+# A foot below the centre of a body may carry it alone, while others touch without a force. They
+# carry it if that foot is shorter: if its free rate is greater by this share of the rate that its
+# force causes. A choice, far above ties and far below the rates of other motions.
+_RAISED = 1e-6
+
 # An impact gains energy if it gains more than this share of its work: some roundings.
 _GAIN = 1e-12
 
@@ -322,17 +327,46 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
     number of each tangent's contact; `has_ratios`, whether some `hold` is not 1.
 
     A friction whose largest force without slip exceeds that of a slipping body is asked again with
-    the slip that it begins, until no other begins to slip.
+    the slip that it begins, until no other begins to slip. Of several sets of contacts that carry a
+    body, one is found in which each pushes.
     """
     x, n = stop_gradient(x), x.closed.shape[0]
     if x.rates.shape == (1,):
         return _settle_one(x)
-    if of == (0,) and len(x.rates) == 2:
-        found = _decide_one(x)
-    elif not of and len(x.rates) <= _FEW:
-        found = _decide_quickly(x)
-    else:
-        found = _decide_in_turn(x, of, has_ratios)
+
+    def decide(x: Contacts) -> _Decided:
+        if of == (0,) and len(x.rates) == 2:
+            return _decide_one(x)
+        if not of and len(x.rates) <= _FEW:
+            return _decide_quickly(x)
+        return _decide_in_turn(x, of, has_ratios)
+
+    if n < 3:
+        return _settled(x, of, decide(x))[0]
+    normals = np.arange(len(x.rates)) < n
+
+    def ask(state: tuple) -> tuple:
+        old, raised, count = state
+        found, is_first = decide(x._replace(rates=x.rates + raised)), count == 0
+        force = forces_in(x, of, found.pushes, found.holds, found.mode)
+        force = jnp.where(is_first, found.force, force)
+        new, idle = _settled(x, of, found._replace(force=force))
+        better = is_first | ~(new.unsolved | jnp.any(idle))
+        raised = jnp.where(normals, _RAISED * _diagonal(x.gains) * force, 0.0)
+        again = is_first & jnp.any(idle) & jnp.any(new.spare)
+        new = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
+        return new, raised, jnp.where(again, 1.0, 2.0)
+
+    shapes = jax.eval_shape(lambda: _settled(x, of, decide(x))[0])
+    nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), shapes)
+    begin = nothing, 0 * x.rates, jnp.zeros((), x.rates.dtype)
+    return jax.lax.while_loop(lambda state: state[2] < 2, ask, begin)[0]
+
+
+def _settled(x: Contacts, of: tuple[int, ...], found: _Decided) -> tuple[Settled, Array]:
+    """Return the answer of `settle`, and for each contact whether it stays closed without a force,
+    though no others hold it."""
+    n = x.closed.shape[0]
     pushed = x.gains @ found.force
     rate = pushed + x.rates
     size = jnp.max(jnp.abs(x.rates)) + jnp.max(jnp.abs(pushed))
@@ -340,7 +374,8 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
     still = ~found.holds & (x.slip == 0) & (moves[n:] == 0)
     # A slip without a force goes where it is accelerated.
     mode = jnp.where(~found.holds & (found.mode == 0), moves[n:], found.mode)
-    kept, spare = x.closed & (found.pushes | (moves[:n] <= 0)), x.closed & False
+    kept = x.closed & (found.pushes | (moves[:n] <= 0))
+    spare, idle = x.closed & False, x.closed & False
     if n > 1 or x.slip.shape[0] > 1:
         pushes, acts, t = found.pushes, found.holds, len(of)
         if n:  # a contact that is about to open is not pushed, but for rounding
@@ -356,10 +391,11 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
             jnp.any(asked), lambda: _redundant(x.gains, first, known) & asked, lambda: asked
         )
         spare = redundant[:n]
+        idle = kept & ~pushes & ~spare
         # Others hold a redundant friction, which keeps its largest force, or none.
         held = still & redundant[n:]
         mode = jnp.where(held, jnp.where(mode == 0, 0.25, 0.75 * mode), mode)
-    return Settled(found.force, rate, kept, spare, mode, found.code != SOLVED)
+    return Settled(found.force, rate, kept, spare, mode, found.code != SOLVED), idle
 
 
 def _decide_quickly(x: Contacts) -> _Decided:

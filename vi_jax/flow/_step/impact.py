@@ -685,7 +685,8 @@ def _resting_bodies(
     shorter time than `before`, and that time; and the modes then, if there is contact friction.
     `at_event` is the state before the impacts, `distances` are those from the stops. A body may be
     pressed on by another that comes to rest at the same instant. Therefore each is tested while
-    those of the others that rest so far and are pressed on are held, until none changes.
+    those of the others that rest so far and are pressed on are held, until none changes. Two of
+    three feet may rest only while none is held: after some passes none is added any more.
 
     So may a body that sticks. An impact may give it a slip that friction stops in a shorter time
     than a series of impacts may take. Such a slip counts as stopped: else the contact that it opens
@@ -694,6 +695,7 @@ def _resting_bodies(
     assert contact is not None
     machine = plan.machine
     slips = _slips_after(plan, lane, at_event) if has_contact_friction(machine) else {}
+    most = len(impacts) + len(slips)
     free = in_modes(plan.machine, lane.modes)
     speeds = {}
     closed = list(contact)
@@ -723,6 +725,7 @@ def _resting_bodies(
             spare = held[k] < 0  # it rests when those rest that hold it
             time = jnp.where(spare, 0.0, time)
             ends = (hit.contact > 0) & (ends | spare) & (stop_gradient(time) < before)
+            ends = ends & ((count < most) | (closed[k] == hit.contact))
             new[k] = jnp.where(ends, hit.contact, contact[k])
             times.append(jnp.where(ends, time, 0.0))
         still = []
@@ -742,10 +745,8 @@ def _resting_bodies(
 
     zero = jnp.zeros_like(s)
     begin = tuple(closed), tuple(zero for _ in impacts), tuple(zero + 1.0 for _ in slips)
-    found, times, _, modes, _, _ = jax.lax.while_loop(
-        lambda x: (x[-2] > 0) & (x[-1] <= len(impacts) + len(slips)), update,
-        (*begin, lane.modes, zero + 1.0, zero),
-    )  # fmt: skip
+    begin = *begin, lane.modes, zero + 1.0, zero
+    found, times, _, modes, _, _ = jax.lax.while_loop(lambda x: x[-2] > 0, update, begin)
     ends = {
         k: pin_flag((hit.contact > 0) & (found[k] == hit.contact), s) for k, hit in impacts.items()
     }

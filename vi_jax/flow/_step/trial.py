@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
-from ...machine import at_stop, is_alive, stops_of, stops_on, switches_of
+from ...machine import at_stop, is_alive, limited_in, stops_of, stops_on, switches_of
 from ..history import end_of_step, new_piece, piece_error
 from ..lane import FREE, Lane, any_of, select, to_event, to_release, to_turn_of, total
 from ..methods import Foreseen, stages_to_step_to
@@ -83,7 +83,11 @@ def locate_release(
     met = rising & aimed & (h <= 2 * linear) & near & ~at_start
     # At the start of so short a step the force was all rounding, and may still be: for example that
     # of a stack released as one, whose bodies separate later.
-    landed = met | aimed & (h <= close)
+    landed, dips = met | aimed & (h <= close), jnp.zeros_like(held)
+    if len(limited_in(plan.machine)) > 1:
+        # A contact that takes over is pressed on from zero: the chord's root is where it begins.
+        dips = (stop_gradient(before) > -least) & (away * slopes[0] * h < -least)
+        landed = landed & ~dips
     left = (rising & (after > 0) | at_start) & ~landed
     steepest = stop_gradient(functools.reduce(jnp.maximum, map(jnp.abs, slopes)))
     lost = landed & ~at_start & (rise > _STEEP * steepest * h + least)
@@ -91,6 +95,7 @@ def locate_release(
     # If the force is barely positive, but for long, chords hardly advance: bisect.
     share = jnp.where(lane.attempts >= _PATIENCE, 0.5, 1 - short)
     place = jnp.where(h > linear, share * place, place)
+    place = place if len(limited_in(plan.machine)) == 1 else jnp.where(dips, 0.5 * h, place)
     # The step ends late by a rounding error, lest the body be pressed on again. No step towards
     # the release is too short to advance the clock.
     late = 8 * float(jnp.finfo(h.dtype).eps) * (plan.unit + stop_gradient(lane.s + h))
@@ -319,10 +324,13 @@ def _path(
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)
         )
-    met = turns_within(turn_tolerance(h) * tolerance_factor(plan, lane), end)
-    aimed = lane.target == to_turn_of(k)
-    for j in range(len(plan.machine.coordinates)):  # several may turn at once
-        aimed = aimed if j == k else aimed | (lane.target == to_turn_of(j))
+    factor, aimed = tolerance_factor(plan, lane), lane.target == to_turn_of(k)
+    met = turns_within(turn_tolerance(h) * factor, end)
+    if len(plan.machine.coordinates) > 1:  # several may turn at once, but each when it turns
+        at_once = turns_within(landing_tolerance(h) * factor, end)
+        at_once = at_once | (lane.direction[k] * stop_gradient(end.v) < 0)
+        for j in range(len(plan.machine.coordinates)):
+            aimed = aimed if j == k else aimed | (lane.target == to_turn_of(j)) & at_once
     if plan.others(lane.state):
         # Such an event may be a turning point as well.
         aimed = aimed | (lane.target >= to_event(len(stops_of(plan.machine))))
