@@ -1,5 +1,6 @@
 """Bifurcations that are closer to each other than the steps along a branch."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -59,3 +60,37 @@ def test_two_points_of_codimension_two_within_a_step():
     assert [point.kind for point in curve.special] == ["fold-flip"] * 2
     places = np.array([point.parameters for point in curve.special])
     np.testing.assert_allclose(places, [[0, 0.299], [0, 0.301]], atol=1e-9)
+
+
+class Turned(vi.Mechanical):
+    """A motor turns an unbalanced rotor between a rigid and a soft stop."""
+
+    q = ("x", "phi")
+    control: float = 1.4
+    cycle = vi.turn_of("phi", usual=5.0)
+    contacts = (
+        vi.RigidStop(0.25, 0.7, on="x"),
+        vi.SoftStop(0.2, 30.0, dashpot=0.4, side="left", on="x"),
+    )
+
+    def mass(self, q):  # pyright: ignore[reportIncompatibleVariableOverride]
+        across = -0.2 * jnp.sin(q.phi)
+        return [[1.0, across], [across, 1.0]]
+
+    def force(self, t, q, v):
+        return dict(x=-q.x - 0.1 * v.x, phi=0.3 * (self.control - v.phi))
+
+
+def test_a_torus_beside_a_fold_and_a_grazing_does_not_depend_on_the_steps():
+    """All three lie within one step. Beside the pole at the grazing the test was rounding."""
+    machine = Turned()
+    settled = vi.simulate(machine, machine.at(v=dict(phi=1.3)), 1, settle=400).last
+    orbit = vi.find_orbit(machine, settled)
+    found = []
+    for bounds in ((0.8, 2.0), (0.9, 1.5)):
+        branch = vi.continue_orbit(orbit, parameter="control", bounds=bounds)
+        assert [point.kind for point in branch.special] == ["grazing", "fold", "neimark-sacker"]
+        found.append(branch.special[-1])
+    assert float(found[0].parameter) == pytest.approx(float(found[1].parameter), abs=1e-13)
+    for point in found:
+        assert abs(abs(point.orbit.multipliers[0]) - 1) < 1e-9

@@ -75,6 +75,11 @@ _LONG = 4.0
 # The description of a branch point at which this branch begins.
 _BEGINS = "a multiplier touches 1: this branch begins at another one, on both sides"
 
+# Before a lost impact, tests are taken at the first of these shares of the step that has multipliers
+# below the second number. With larger ones their products are rounding: at 5e5 a Neimark–Sacker
+# point was missed.
+_BEFORE_POLE, _LARGE = (LOCATED, 1e-5, 1e-4), 1e4
+
 # Most halvings of a step to separate bifurcations in it: a 100,000th of it is left.
 _MOST_HALVINGS = 17
 
@@ -204,10 +209,13 @@ class MotionTable(Table):
             return self._end_with(GRAZING, at, detail)
         # At a lost impact a multiplier goes to infinity and returns from the other side. Its sign
         # is that of rounding, and the tests for bifurcations may have changed sign twice.
-        before_pole = self._partway(here, at, 1 - LOCATED)
-        before_pole = before_pole if bool(before_pole.good) else at
-        M, values = before_pole.observed.monodromy, before_pole.observed.multipliers
-        at = at._replace(observed=at.observed._replace(monodromy=M, multipliers=values))
+        steps = (self._partway(here, at, 1 - share) for share in _BEFORE_POLE)
+        steps = [step for step in steps if bool(step.good)] or [at]
+        seen = steps[0].observed
+        is_clear = (step for step in steps if np.abs(step.observed.multipliers).max() < _LARGE)
+        before_pole = next(is_clear, steps[-1])
+        seen = at.observed._replace(monodromy=seen.monodromy, multipliers=seen.multipliers)
+        at = at._replace(observed=seen)
         return self._end_with(GRAZING, at, detail, impact)._replace(until=before_pole)
 
     def _origin_events(self, here: Step) -> Iterator[Event]:
