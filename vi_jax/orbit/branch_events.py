@@ -75,9 +75,9 @@ _LONG = 4.0
 # The description of a branch point at which this branch begins.
 _BEGINS = "a multiplier touches 1: this branch begins at another one, on both sides"
 
-# Before a lost impact, tests are taken at the first of these shares of the step that has multipliers
-# below the second number. With larger ones their products are rounding: at 5e5 a Neimark–Sacker
-# point was missed.
+# Before a lost impact, tests are taken at the first of these shares of the step at which all
+# multipliers are below the second number. The products of larger ones are rounding: at 5e5 a
+# Neimark–Sacker point was missed.
 _BEFORE_POLE, _LARGE = (LOCATED, 1e-5, 1e-4), 1e4
 
 # Most halvings of a step to separate bifurcations in it: a 100,000th of it is left.

@@ -160,9 +160,10 @@ def lyapunov(
     vanish smoothly at both ends (Das, Saiki, Sander and Yorke 2017). On periodic and quasi-periodic
     motions this converges faster than any power of the number of cycles, after some tens of the
     motion's periods. The exponent 0 along the motion is not included, unless the machine is
-    autonomous: then it is observed at intervals of its usual `cycle`. A motion that rests on a stop
-    forgets its past at once: its exponent is -∞, or very negative if rounding remains at the
-    release. Works under `jit` and `vmap`.
+    autonomous: then it is observed at intervals of its usual `cycle`. Impacts that cross the ends
+    of these intervals slow the convergence (2,000 of a rotor with two stops left 3e-7). A motion
+    that rests on a stop forgets its past at once: its exponent is -∞, or very negative if rounding
+    remains at the release. Works under `jit` and `vmap`.
 
     **Arguments:**
 
