@@ -183,3 +183,10 @@ def test_recursive_functions_are_verifiable_and_opaque_objects_are_not():
         typed["measure"],
     ):
         assert identity(thing).startswith(UNVERIFIABLE)
+
+
+PAIR = [lambda x: 0.1 * x, lambda x: 0.2 * x]
+
+
+def test_functions_on_one_line_differ():
+    assert identity(PAIR[0]) != identity(PAIR[1])

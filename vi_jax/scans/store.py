@@ -450,6 +450,9 @@ def _parts(thing: Any) -> list[Any]:
         if inspect.getfile(thing) == "<string>":  # Python 3.13 names the source of `python -c` so
             raise OSError("it was made by `exec`")
         source = inspect.getsource(thing)
+        if thing.__name__ == "<lambda>":  # a line may have several
+            columns = [x[2] for x in thing.__code__.co_positions() if x[2]]
+            source += str(min(columns, default=0))
         named = _named(thing.__code__)
         loaded = sorted(_globals_of(thing.__code__) & {*thing.__globals__})
         known = {n: thing.__globals__[n] for n in loaded}
