@@ -175,6 +175,19 @@ def test_orbits_sweeps_scans_and_basins_agree_with_runs_of_scalars():
     np.testing.assert_allclose(branch.y_max, branch.parameter, atol=1e-10)
 
 
+@pytest.mark.slow
+def test_what_follows_a_grazing_with_arrays_is_as_with_scalars():
+    found = []
+    for machine in (Chain(Numbers), MACHINE):
+        orbit = vi.find_orbit(machine, vi.simulate(machine, settle=200).last)
+        branch = vi.continue_orbit(orbit, parameter="gap", bounds=(0.5, 3.0), progress=False)
+        point = next(x for x in branch.special if x.kind == "grazing")
+        graze = vi.grazing(point, check=False)
+        found.append((str(graze.outcome), [point.parameter, *graze.entries]))
+    assert found[0][0] == found[1][0]
+    np.testing.assert_allclose(found[0][1], found[1][1], rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     "call",
     [

@@ -193,8 +193,7 @@ def without_events(
 
 
 def with_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
-    leaves = jax.tree.leaves(sections_at(old, x)[0])
-    rows = np.stack([np.asarray(leaf) for leaf in leaves], axis=-1)
+    rows = np.asarray(in_rows(sections_at(old, x)[0]))
     for cycles in range(1, old.cycles):
         repetitions, remainder = divmod(old.cycles, cycles)
         difference = np.abs(np.roll(rows, -cycles, axis=0) - rows) / np.asarray(old.sizes)[1:]
