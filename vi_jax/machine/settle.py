@@ -357,8 +357,7 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
         new = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
         return new, raised, jnp.where(again, 1.0, 2.0)
 
-    shapes = jax.eval_shape(lambda: _settled(x, of, decide(x))[0])
-    nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), shapes)
+    nothing = Settled(x.rates, x.rates, x.closed, x.closed, x.slip, jnp.zeros((), bool))
     begin = nothing, 0 * x.rates, jnp.zeros((), x.rates.dtype)
     return jax.lax.while_loop(lambda state: state[2] < 2, ask, begin)[0]
 
@@ -470,8 +469,8 @@ def _decide_in_turn(x: Contacts, of: tuple[int, ...], has_ratios: bool) -> _Deci
         slip = jnp.where(returns, x.slip, jnp.where(first, new.mode, slip))
         return slip, new, jnp.where(again, 1.0, 0.0), count + 1.0
 
-    shapes, zero = jax.eval_shape(lambda: _decide(x, of)), jnp.zeros((), x.rates.dtype)
-    nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), shapes)
+    zero = jnp.zeros((), x.rates.dtype)
+    nothing = _Decided(x.closed, x.slip > 0, x.slip, x.rates, zero)
     begin = x.slip, nothing, zero + 1, zero
     return jax.lax.while_loop(lambda state: state[2] > 0, ask, begin)[1]
 

@@ -210,12 +210,15 @@ class MotionTable(Table):
         # At a lost impact a multiplier goes to infinity and returns from the other side. Its sign
         # is that of rounding, and the tests for bifurcations may have changed sign twice.
         steps = (self._partway(here, at, 1 - share) for share in _BEFORE_POLE)
-        steps = [step for step in steps if bool(step.good)] or [at]
-        seen = steps[0].observed
-        is_clear = (step for step in steps if np.abs(step.observed.multipliers).max() < _LARGE)
-        before_pole = next(is_clear, steps[-1])
-        seen = at.observed._replace(monodromy=seen.monodromy, multipliers=seen.multipliers)
-        at = at._replace(observed=seen)
+        steps = (step for step in steps if bool(step.good))
+        before_pole = next(steps, at)
+        M, values = before_pole.observed.monodromy, before_pole.observed.multipliers
+        at = at._replace(observed=at.observed._replace(monodromy=M, multipliers=values))
+        while not np.abs(before_pole.observed.multipliers).max() < _LARGE:
+            further = next(steps, None)
+            if further is None:
+                break
+            before_pole = further
         return self._end_with(GRAZING, at, detail, impact)._replace(until=before_pole)
 
     def _origin_events(self, here: Step) -> Iterator[Event]:

@@ -89,9 +89,8 @@ def locate_zero(
         resolution = max(min(ROUGHLY, float(points[end].size)) for end in bracket.values())
         close = len(bracket) == 2 and abs(bracket[True] - bracket[False]) <= resolution
         # Of the largest value of either sign, since near a pole those of one are of any size.
-        least = min(max((sign * x for x in tested.values()), default=0.0) for sign in (1, -1))
-        is_zero = found == 0 or abs(found) <= _PLACED * max(least, 0.0)
-        return 0.0 if close or is_zero else found
+        largest = (max(0.0, *(sign * x for x in (found, *tested.values()))) for sign in (1, -1))
+        return 0.0 if close or abs(found) <= _PLACED * min(largest) else found
 
     # If the test jumps or has no value, use the closest point.
     try:

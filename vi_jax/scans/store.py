@@ -471,15 +471,21 @@ def _is_users(module: str | None) -> bool:
 
 def _named(code: types.CodeType) -> set[str]:
     """Return the names that a function reads, also within the functions that it defines."""
-    inner = (x for x in code.co_consts if isinstance(x, types.CodeType))
-    return {*code.co_names}.union(*map(_named, inner))
+    return {name for each in _with_inner(code) for name in each.co_names}
 
 
 def _globals_of(code: types.CodeType) -> set[str]:
     """Return the names of the globals that a function reads. The names of attributes are others."""
-    inner = (x for x in code.co_consts if isinstance(x, types.CodeType))
-    loads = {x.argval for x in dis.get_instructions(code) if x.opname in _LOADS}
-    return loads.union(*map(_globals_of, inner))
+    instructions = (x for each in _with_inner(code) for x in dis.get_instructions(each))
+    return {x.argval for x in instructions if x.opname in _LOADS}
+
+
+def _with_inner(code: types.CodeType) -> Iterator[types.CodeType]:
+    """Yield the code of a function and of those that it defines."""
+    yield code
+    for x in code.co_consts:
+        if isinstance(x, types.CodeType):
+            yield from _with_inner(x)
 
 
 def _members_of_modules(modules: list[types.ModuleType], named: set[str]) -> Iterator[Any]:

@@ -83,8 +83,9 @@ def locate_release(
     met = rising & aimed & (h <= 2 * linear) & near & ~at_start
     # At the start of so short a step the force was all rounding, and may still be: for example that
     # of a stack released as one, whose bodies separate later.
-    landed, dips = met | aimed & (h <= close), jnp.zeros_like(held)
-    if len(limited_in(plan.machine)) > 1:
+    landed, may_dip = met | aimed & (h <= close), len(limited_in(plan.machine)) > 1
+    dips = jnp.zeros_like(held)
+    if may_dip:
         # A contact that takes over is pressed on from zero: the chord's root is where it begins.
         dips = (stop_gradient(before) > -least) & (away * slopes[0] * h < -least)
         landed = landed & ~dips
@@ -95,7 +96,7 @@ def locate_release(
     # If the force is barely positive, but for long, chords hardly advance: bisect.
     share = jnp.where(lane.attempts >= _PATIENCE, 0.5, 1 - short)
     place = jnp.where(h > linear, share * place, place)
-    place = place if len(limited_in(plan.machine)) == 1 else jnp.where(dips, 0.5 * h, place)
+    place = jnp.where(dips, 0.5 * h, place) if may_dip else place
     # The step ends late by a rounding error, lest the body be pressed on again. No step towards
     # the release is too short to advance the clock.
     late = 8 * float(jnp.finfo(h.dtype).eps) * (plan.unit + stop_gradient(lane.s + h))
