@@ -41,7 +41,7 @@ from .friction import (
 )
 from .leaves import (
     by_name, check_again, check_leaf, check_name, components, first_few, in_rows, leaf, leaf_names,
-    near_names, size_by, size_of, with_leaf, with_leaves,
+    near_names, size_by, size_of, states_from_rows, with_leaf, with_leaves,
 )
 from .mechanical import Mechanical
 from .modes import (

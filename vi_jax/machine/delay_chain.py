@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._checks import count
+from .._programs import compiled
 from .._types import Scalar, State, Vector
 from .base import AbstractMachine
 from .contacts import shown_modes
@@ -144,8 +145,13 @@ def _chained(self: Any, state: Any) -> Any:
         before = history_before(machine, state)
         values = jax.vmap(lambda t: chain.form.pack(before(t)))(times)
     else:
-        values = jax.vmap(history.at)(times)
+        values = _numbers_at(history, times)
     return with_modes(Named(**vars(state), **{_NAME: values}), modes)
+
+
+@compiled
+def _numbers_at(history: Any, times: Any) -> Array:
+    return jax.vmap(history.at)(times)
 
 
 def machine_of_chain(machine: Any) -> Any:

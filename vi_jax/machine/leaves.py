@@ -1,6 +1,7 @@
 """Numbers of a machine or a state by name: `"drive.frequency_ratio"`, `"stops.0.gap"`, `"v.x"`."""
 
 import difflib
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import from_host
+from .._checks import array_module, from_host
 from .._types import Machine, Scalar, State
 from .overrides import warn_of_unread
 
@@ -38,10 +39,22 @@ def components(state: State, lead: int = 0) -> dict[str, Any]:
     return found
 
 
-def in_rows(states: State, lead: int = 1) -> Array:
-    """Return a batch of states with `lead` leading axes as rows, in the order of `ravel_pytree`."""
-    leaves = [jnp.asarray(x) for x in jtu.tree_leaves(states)]
-    return jnp.concatenate([x.reshape(*x.shape[:lead], -1) for x in leaves], axis=-1)
+def in_rows(states: State, lead: int = 1) -> Any:
+    """Return a batch of states with `lead` leading axes as rows, in the order of `ravel_pytree`; of
+    NumPy arrays as one."""
+    array = array_module(*jtu.tree_leaves(states))
+    leaves = [array.asarray(x) for x in jtu.tree_leaves(states)]
+    return array.concatenate([x.reshape(*x.shape[:lead], -1) for x in leaves], axis=-1)
+
+
+def states_from_rows(like: State, rows: Any) -> State:
+    """Return rows (..., numbers), in the order of `in_rows`, as states like this one with their
+    leading axes; host-side, since `unravel` compiles a program for each leaf."""
+    leaves, structure = jtu.tree_flatten(like)
+    shapes, rows = [jnp.shape(x) for x in leaves], np.asarray(rows)
+    parts = np.split(rows, np.cumsum([math.prod(x) for x in shapes])[:-1], axis=-1)
+    found = [x.reshape((*rows.shape[:-1], *shape)) for x, shape in zip(parts, shapes, strict=True)]
+    return from_host(jtu.tree_unflatten(structure, found))
 
 
 def size_of(part: Callable[[State], Scalar], state: State, sizes: State) -> Scalar:

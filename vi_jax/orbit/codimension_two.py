@@ -13,7 +13,7 @@ import numpy as np
 
 from .._messages import count_of
 from .conditions import Special, bifurcation_tests, is_defective, sum_of_minors
-from .corrector import Step, advance, distance_along, jacobian_and_rows, jacobian_at, on_host
+from .corrector import Step, advance, distance_along, host_program, jacobian_and_rows, jacobian_at
 from .edit_events import half_difference, may_be_symmetric, over_periods, repeated
 from .equations import Shooting
 from .kinds import (
@@ -211,7 +211,7 @@ def _cusp_test(motion: Shooting) -> Test:
     return test
 
 
-@on_host
+@host_program
 def _derivatives_along(problem: Shooting, x, right, bend):
     """Return the equations' second and third derivatives d/dt along x + t right + t² bend/2."""
 

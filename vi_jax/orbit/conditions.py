@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from .._types import Scalar, Vector
 from ..flow import average_names, quantities_on, quantity_names
 from ..machine import components, frequency_ratio, in_unit, quantity_of, units_of, with_leaf
-from .corrector import Step, jacobian_at, on_host
+from .corrector import Step, host_program, jacobian_at
 from .equations import Observed, Shooting
 from .kinds import CROSSING, DOUBLING, FOLD, KINDS, REST, SLIDING, TORUS, TOUCHING, TURNS
 from .linear import solve
@@ -70,7 +70,7 @@ def quantity_at(problem: Shooting, x: Vector, observed: Observed, name: str) -> 
     return quantities_on(problem.at(x), row)[component][0]
 
 
-@on_host
+@host_program
 def rates_at(
     problem: Shooting, names: tuple[str, ...], x: Vector, direction: Vector
 ) -> tuple[dict[str, Scalar], dict[str, Scalar]]:

@@ -57,7 +57,7 @@ def distance_along(problem: Shooting, here: Step, at: Step) -> float:
     return float(np.dot(here.tangent, (at.x - here.x) / problem.scale))
 
 
-def on_host(function: Callable[..., Any]) -> Callable[..., Any]:
+def host_program(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function whose arguments and results are arrays and floats of the host, so that
     operations on the results cost no dispatch."""
     program = compiled(function)
@@ -84,7 +84,7 @@ def scaled_jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Arra
     return columns.T / rows[:, None], values[0] / rows, rows
 
 
-@on_host
+@host_program
 def _advance(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, length: Scalar) -> Step:
     """Advance as `advance` does, without observations, by Newton's method on the equations and the
     plane. The parameter is one of the unknowns, so the Jacobian is not near singular at a fold."""
@@ -125,7 +125,7 @@ def advance(problem: Shooting, x: Unknowns, tangent: Unknowns, length: float) ->
 # them.
 
 
-@on_host
+@host_program
 def _observe(motion: Shooting, x):
     return motion.observe(x)
 
@@ -135,7 +135,7 @@ def observe(problem: Shooting, x: Unknowns) -> Any:
     return _observe(*problem.motion_at(x))
 
 
-@on_host
+@host_program
 def _residual(motion: Shooting, x, steps):
     ends = motion.motion_residual(x, steps)[: motion.legs * motion.states]
     return ends.reshape(-1, motion.states) / motion.sizes[1:]
@@ -155,12 +155,12 @@ def tangent_at(problem: Shooting, x: np.ndarray) -> np.ndarray:
     return tangent * np.copysign(1.0, tangent[-1])
 
 
-@on_host
+@host_program
 def state_at(problem: Shooting, x, leg, s):
     return ravel_pytree(problem.state_at(x, leg, s))[0]
 
 
-@on_host
+@host_program
 def _jacobian_at(problem: Shooting, x, scale):
     jacobian, _, rows = scaled_jacobian(lambda y: problem.residual(y * scale), x / scale)
     return jacobian, rows

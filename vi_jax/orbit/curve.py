@@ -282,7 +282,7 @@ class Curve(abc.ABC):
             "impact_phase": (("point", "impact"), self.impact_phase),
             "impact_speed": (("point", "impact"), self.impact_speed),
             "multipliers": (("point", "state"), self.multipliers),
-            "stability": ("point", in_names(jax.vmap(stability_of)(jnp.asarray(self.multipliers)))),
+            "stability": ("point", in_names(stability_of(self.multipliers))),
         }
         data |= special_table(self.special, self.names)
         attributes = {"parameter": self.names[0], "period_in_cycles": self.cycles}

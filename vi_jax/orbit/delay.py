@@ -4,11 +4,12 @@ import dataclasses
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ..flow import history_of_function, row_sizes, simulate, unit_of
+from .._checks import from_host, on_host
+from .._programs import compiled
+from ..flow import history_of_function, simulate, sizes_on_host, unit_of
 from ..machine import (
     AbstractMachine,
     HybridState,
@@ -57,11 +58,10 @@ def with_delay_error(orbit: Orbit) -> Orbit:
     if orbit.residual.ndim or not bool(orbit.successful):
         return orbit
     state, cycles = without_modes(orbit.state), int(orbit.cycles)
-    past = history_in(chain, orbit.state)
-    history = history_of_function(machine, past, unit_of(machine), _PIECES, _ROOM)
+    history = _history_of_chain(chain, orbit.state)
     # The run begins with the polynomial of the nodes, in which kinks are smooth. A stable motion
     # forgets them; from an unstable one the run departs, and one longest delay must do.
-    largest = float(jnp.max(jnp.abs(orbit.multipliers)))
+    largest = float(np.abs(orbit.multipliers).max())
     periods = 1 + int(np.ceil(float(longest_delay(machine)) / float(orbit.duration)))
     if largest < 1:
         periods += int(min(np.log(SAME) / np.log(max(largest, 1e-3)), _MOST_PERIODS))
@@ -69,9 +69,17 @@ def with_delay_error(orbit: Orbit) -> Orbit:
     start = HybridState(own, modes_of(orbit.state) or (), history)
     record = "motion" if is_autonomous(chain, state) else "sections"
     run = simulate(machine, start, periods * cycles, method=orbit.method, record=record)
-    last, row = in_rows(run.sections)[-1], in_rows(own, 0)
-    error = distance(last, row, row_sizes(chain, state)[: row.size])
+    last, row = in_rows(on_host(run.sections))[-1], in_rows(on_host(own), 0)
+    sizes = sizes_on_host(chain, state, in_rows(on_host(state), 0))
+    error = distance(last, row, sizes[: row.size])
     if run.duration is not None:  # on a section one number of the state is always the same
-        duration = jnp.sum(run.duration[-cycles:])
-        error = jnp.maximum(error, jnp.abs(duration / orbit.duration - 1))
-    return dataclasses.replace(orbit, delay_error=error)
+        duration = np.asarray(run.duration)[-cycles:].sum()
+        error = np.maximum(error, abs(duration / np.asarray(orbit.duration) - 1))
+    return dataclasses.replace(orbit, delay_error=from_host(error))
+
+
+@compiled
+def _history_of_chain(chain: Any, state: Any) -> Any:
+    """Return the history in a state of a chain, for a run of its machine."""
+    machine, past = machine_of_chain(chain), history_in(chain, state)
+    return history_of_function(machine, past, unit_of(machine), _PIECES, _ROOM)

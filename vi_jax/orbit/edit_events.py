@@ -13,8 +13,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from .._checks import on_host
 from ..machine import AbstractMachine, in_rows, nearest_images, stops_of
-from .corrector import Step, advance, observe, on_host, sections_at, state_at, tangent_at
+from .corrector import Step, advance, host_program, observe, sections_at, state_at, tangent_at
 from .equations import Shooting
 from .flight import Event, section_of
 from .locate import find_zero_near
@@ -67,7 +68,7 @@ def may_repeat(problem: Shooting) -> bool:
     return problem.cycles % 2 == 0 and not odd and repeats_from(problem, half)
 
 
-@on_host
+@host_program
 def _differences(
     problem: Shooting, x: Float[Array, " unknowns"], mirrored: bool
 ) -> Float[Array, " differences"]:
@@ -162,7 +163,7 @@ def with_sections(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
     if not old.omits_sections:
         return old, x
     (clock, states, period), (section_states, sections, _) = old.values(x), sections_at(old, x)
-    ends = old.within_turn(1, np.asarray(in_rows(section_states)))
+    ends = old.within_turn(1, in_rows(on_host(section_states)))
     states, (legs, section_clock) = old.within_turn(0, states), map(np.asarray, sections)
     clock = np.mod(np.concatenate([section_clock, clock]) - section_clock[0], period)
     clock[0], order = 0.0, np.argsort(clock, kind="stable")
@@ -193,7 +194,7 @@ def without_events(
 
 
 def with_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
-    rows = np.asarray(in_rows(sections_at(old, x)[0]))
+    rows = in_rows(on_host(sections_at(old, x)[0]))
     for cycles in range(1, old.cycles):
         repetitions, remainder = divmod(old.cycles, cycles)
         difference = np.abs(np.roll(rows, -cycles, axis=0) - rows) / np.asarray(old.sizes)[1:]

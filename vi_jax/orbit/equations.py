@@ -42,6 +42,7 @@ from ..machine import (
     mode_number,
     nearest_images,
     section_number,
+    states_from_rows,
     stops_of,
     with_component,
     with_leaf,
@@ -349,7 +350,10 @@ class Shooting(eqx.Module):
         end = len(self.events) + max(1, half) * self.states
         return np.concatenate([scale[:half], scale[len(self.events) : end]])
 
-    def unravel(self, u: Vector) -> State:
+    def unravel(self, u: Any) -> State:
+        """Return a row as a state; of a NumPy array host-side, also several rows."""
+        if isinstance(u, np.ndarray):
+            return states_from_rows(self.like, u)
         return ravel_pytree(self.like)[1](u)
 
     def modes_in(self, leg: Leg) -> tuple[Array, ...]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from .._checks import from_host
+from .._checks import from_host, on_host
 from .._programs import compiled
 from .._types import Scalar, Scalars, State
 from ..flow import (
@@ -56,6 +56,7 @@ from ..machine import (
     section_in,
     section_number,
     size_of,
+    states_from_rows,
     stops_of,
     switches_of,
     with_component,
@@ -63,7 +64,7 @@ from ..machine import (
     with_modes,
     without_modes,
 )
-from .corrector import fewest_steps, on_host, step_error, steps_depend_on_motion
+from .corrector import fewest_steps, host_program, step_error, steps_depend_on_motion
 from .equations import Shooting, Unknowns
 from .flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
 from .results import Orbit
@@ -279,11 +280,11 @@ def _check_instants(
     span = max((abs(place) for place, _ in found), default=0.0)
     for i, (place, event) in enumerate(found):
         if abs(place - previous) <= ROUNDING * span and event.cycle is None:
-            state, modes = blank.unravel(jnp.asarray(states[i])), in_flight[i - 1]
+            state, modes = blank.unravel(states[i]), in_flight[i - 1]
             modes = tuple(jnp.asarray(mode) for mode in modes)
             before = Flight(machine, modes, blank.method, blank.like)
             guard = partial(guard_at, before, event, jnp.asarray(place))
-            sizes = blank.unravel(jnp.asarray(np.abs(states).max(axis=0)))
+            sizes = blank.unravel(np.abs(states).max(axis=0))
             if abs(float(guard(state))) > LOCATED * (float(size_of(guard, state, sizes)) or 1.0):
                 raise ValueError(
                     f"Argument `orbit` must have no event whose guard jumps, but that of "
@@ -448,12 +449,12 @@ def event_numbers(machine: AbstractMachine, kind: np.ndarray, number: np.ndarray
     return number + np.select(others, [stops, stops + switches], 0)
 
 
-@on_host
+@host_program
 def _fly(blank: Shooting, steps, modes, s0, s1, u):
     return Flight(blank.machine, modes, blank.method, blank.like).fly(s0, s1, u, steps)[0]
 
 
-@on_host
+@host_program
 def _jump(blank: Shooting, number: int, s, u, modes):
     after, modes = after_event(blank.machine, number, s, blank.unravel(u), modes)
     return ravel_pytree(after)[0], modes
@@ -537,7 +538,7 @@ def _states_at(
     problem: Shooting, orbit: Orbit, run: Run, clocks: np.ndarray, begins: np.ndarray
 ) -> np.ndarray:
     """Return the states of a motion at some clocks since its section, (clocks, states)."""
-    sections, found = np.asarray(in_rows(orbit.sections, 1)), []
+    sections, found = in_rows(on_host(orbit.sections), 1), []
     for clock in clocks % begins[-1]:
         n = int(np.searchsorted(begins, clock, side="right")) - 1
         row, modes = jnp.asarray(sections[n]), tuple(mode[n] for mode in run.modes)
@@ -574,7 +575,7 @@ def _modes_in_legs(
     found = [modes] * problem.legs
     first = int(np.searchsorted(clocks, period))
     for i in [*range(first, len(clocks)), *range(first)]:
-        event, at_event = problem.events[i], problem.unravel(jnp.asarray(rows[i]))
+        event, at_event = problem.events[i], problem.unravel(rows[i])
         if event.use != LEAVES:
             s, contact = jnp.asarray(clocks[i]), problem.flight(machine, i - 1).contact
             # A force that releases a body is not too large before.
@@ -589,8 +590,8 @@ def _contact(machine: AbstractMachine, state: Any, events: tuple[Event, ...]) ->
     """Return, per coordinate, 1 + i if it always rests on stop number i, else 0."""
     contact, stops = [0.0] * len(machine.coordinates), stops_of(machine)
     moves = {stops[event.number].coordinate for event in events if event.use}
-    row, unravel = ravel_pytree(state)
-    sizes = unravel(jnp.asarray(sizes_on_host(machine, state, np.asarray(row))))
+    row = in_rows(on_host(state), 0)
+    sizes = states_from_rows(state, sizes_on_host(machine, state, row))
     for i, stop in enumerate(stops):
         position = machine.coordinates[stop.coordinate].position
         place, unit = position(state), float(size_of(position, state, sizes))

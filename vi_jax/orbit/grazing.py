@@ -17,7 +17,7 @@ from .._checks import count, flag, instance_of
 from .._messages import at_work, count_of
 from ..flow import simulate
 from ..machine import Stated, Summarized, in_rows, in_unit, stated, stops_of
-from .corrector import method_of_runs, on_host
+from .corrector import host_program, method_of_runs
 from .equations import Shooting
 from .flight import Event
 from .forecast import (
@@ -56,7 +56,7 @@ class SimulatedAttractors(NamedTuple):
     """All impacts in `far` periods of the motion that grazes; in one of them if `far` is 0."""
 
 
-@on_host
+@host_program
 def _simulate_lanes(problem: Shooting, values, states, cycles: int, settle: int):
     """Return sections and impacts of the last cycles, (lanes, cycles)."""
 
@@ -135,7 +135,7 @@ class Motions(NamedTuple):
     """The first coordinate on the section, less that of the smooth motion."""
 
 
-@on_host
+@host_program
 def _position_of(problem: Shooting, states):
     position = lambda u: problem.machine.position(problem.unravel(u))
     return jax.vmap(position)(states.reshape(-1, problem.states)).reshape(states.shape[:-1])

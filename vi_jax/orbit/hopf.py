@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from .._types import Scalar, Vector
 from ..machine import AbstractMachine, jumps_on_section, section_in
-from .corrector import Step, observe, on_host
+from .corrector import Step, host_program, observe
 from .equations import Shooting, Unknowns
 from .flight import section_of
 from .tolerances import LOCATED, ROUNDING
@@ -30,7 +30,7 @@ def _rate(problem: Shooting, machine: AbstractMachine, u: Vector) -> Vector:
     return problem.flight(machine, 0).rate(jnp.zeros((), u.dtype), u)
 
 
-@on_host
+@host_program
 def _section_rate(problem: Shooting, x: Vector) -> tuple[Vector, Scalar]:
     """Return the rate of a motion on its section, in the sizes of the state, and its period."""
     machine = problem.at(x)
@@ -65,7 +65,7 @@ def hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
     return _motion_about(problem, here, *found)
 
 
-@on_host
+@host_program
 def _linearise(problem: Shooting, x: Vector) -> tuple[Array, Scalar, Vector]:
     """Return the field's derivative in the state of `x`, the section there and its derivative."""
     machine, u = problem.at(x), problem.parts(x)[1][0]
@@ -73,7 +73,7 @@ def _linearise(problem: Shooting, x: Vector) -> tuple[Array, Scalar, Vector]:
     return jax.jacfwd(partial(_rate, problem, machine))(u), section, slope
 
 
-@on_host
+@host_program
 def _residual(problem: Shooting, y: Vector, scale: Vector, like: Array) -> tuple[Vector, Array]:
     """Return the residual of the equations of an equilibrium u with an eigenvector v to iω, and its
     derivative. The unknowns (u, p, ω, Re v, Im v) are y·scale; `like` fixes v in length and

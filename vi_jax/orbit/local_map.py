@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from .corrector import on_host, since_section, tangent_at
+from .corrector import host_program, since_section, tangent_at
 from .edit_events import with_least_period, with_sections, without_events
 from .equations import Shooting
 from .kinds import with_article
@@ -187,7 +187,7 @@ def _changes_at_once(problem: Shooting, x: np.ndarray, i: int) -> set[int]:
     return found
 
 
-@on_host
+@host_program
 def _flight_matrix(problem: Shooting, x, leg, s0, s1):
     machine = problem.at(x)
     u = ravel_pytree(problem.state_at(x, leg, s0))[0]
@@ -195,7 +195,7 @@ def _flight_matrix(problem: Shooting, x, leg, s0, s1):
     return jax.jacfwd(lambda u: flight.fly(s0, s1, u, problem.steps)[0])(u)
 
 
-@on_host
+@host_program
 def _event_matrix(problem: Shooting, x, leg):
     clock, states = problem.parts(x)
     return problem.saltation(problem.at(x), leg, clock[leg], states[leg])[0]
@@ -231,7 +231,7 @@ def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) 
     return Section(state, slope, matrix * sizes / sizes[:, None])
 
 
-@on_host
+@host_program
 def _section_state(problem: Shooting, x, along, leg, s):
     """Return the state on the section at clock `s`, and its derivative along the parameter."""
     turns = jnp.round(s / problem.period(x))  # 0 or 1: the section moves with the period

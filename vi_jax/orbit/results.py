@@ -591,7 +591,7 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
 
         found = in_one_row(orbits.successful)
         flat = jtu.tree_map(in_one_row, orbits)
-        sections, cycles = np.asarray(in_rows(flat.sections, 2)), flat.cycles
+        sections, cycles = in_rows(on_host(flat.sections), 2), flat.cycles
         modes = np.zeros((*sections.shape[:2], 0))
         modes = np.stack(flat.modes, axis=-1) if flat.modes else modes
         angles = angles_in(orbits.machine, jtu.tree_map(lambda x: x[0, 0], flat.sections))

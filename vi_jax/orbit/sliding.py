@@ -28,7 +28,7 @@ from ..machine import (
     guard_of,
     mode_number,
 )
-from .corrector import Step, observe, on_host, state_at
+from .corrector import Step, host_program, observe, state_at
 from .edit_events import without_events
 from .equations import Leg, Shooting
 from .flight import Event, Flight
@@ -150,7 +150,7 @@ def _held(problem: Shooting, machine: AbstractMachine, leg: Leg, number: int) ->
     return Flight(machine, modes, problem.method, problem.like, contact)
 
 
-@on_host
+@host_program
 def _excess_at(problem: Shooting, x, leg, number: int, s, at_event: bool):
     machine, states = problem.at(x), problem.parts(x)[1]
     # At an event the state just before it; otherwise the leg is integrated.

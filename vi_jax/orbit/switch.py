@@ -245,7 +245,7 @@ def _in_two_parameters(
     ((name, (value, size)),) = point.further.items()
     problem_two = dataclasses.replace(
         problem, parameters=(name, *problem.parameters), conditions=(condition,),
-        widths=jnp.insert(problem.widths, 0, size),
+        widths=np.insert(np.asarray(problem.widths), 0, size),
     )  # fmt: skip
     return problem_two, np.insert(x, -1, value)
 

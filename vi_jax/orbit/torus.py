@@ -11,7 +11,7 @@ import numpy as np
 from .._checks import count, given_number, instance_of
 from .._messages import count_of
 from .._programs import compiled
-from .._types import State
+from .._types import Scalar, State
 from ..flow import (
     RESULTS,
     AbstractMethod,
@@ -31,6 +31,7 @@ from ..machine import (
     modes_of,
     nearest_images,
     raveled,
+    states_from_rows,
     with_modes,
     without_modes,
 )
@@ -126,7 +127,7 @@ class Torus:
         """Return the states on the section at angles θ, in turns; leaves have their shape."""
         angle = np.asarray(angle, float)
         rows = self.equations.on_section(self.curve, np.mod(angle.ravel(), 1.0))
-        states = jax.vmap(self.problem.unravel)(jnp.asarray(rows))
+        states = self.problem.unravel(rows)
         return jax.tree.map(lambda a: np.asarray(a).reshape(angle.shape + a.shape[1:]), states)
 
     @cached_property
@@ -316,8 +317,8 @@ def _start_equations(
 ) -> tuple[Equations, np.ndarray]:  # fmt: skip
     """Return the equations of the curve through some states on the section, and the unknowns of the
     motions that begin there, (nodes, unknowns)."""
-    unravel, modes = raveled(like)[1], modes_of(like) or ()
-    starts = [with_modes(unravel(jnp.asarray(row)), modes) for row in rows]
+    state, modes = without_modes(like), modes_of(like) or ()
+    starts = [with_modes(states_from_rows(state, row), modes) for row in rows]
     problems, xs = zip(*(_followed(machine, method, s, cycles) for s in starts), strict=True)
     problem, x = max(problems, key=lambda p: p.steps), np.stack(xs)
     for i, other in enumerate(problems):
@@ -464,15 +465,23 @@ def _measured_rotation(
             "Argument `start` must settle on a quasi-periodic motion, but this one repeats after "
             f"{period}: find and follow that orbit."
         )
-    seen = without_angles(jnp.asarray(rows), sizes, angles_in(machine, like))
-    digits = float(agreement(seen))
+    angles = angles_in(machine, like)
+    angles = None if angles is None else tuple(angles.tolist())  # static
+    digits, turns = (float(x) for x in _averages(rows, sizes, angles))
     if digits < QUASIPERIODIC:
         raise ValueError(
             "Argument `start` must settle on a quasi-periodic motion, but averages over both "
             f"halves of the run agree to {digits:.2g} digits only. A slowly settling motion needs "
             "more `settle`; a chaotic one has no torus."
         )
-    return float(rotation_number(seen))
+    return turns
+
+
+@compiled
+def _averages(rows: Any, sizes: Any, angles: tuple | None) -> tuple[Scalar, Scalar]:
+    """Return the digits to which averages of a run agree, and its rotation number."""
+    seen = without_angles(rows, sizes, None if angles is None else np.asarray(angles))
+    return agreement(seen), rotation_number(seen)
 
 
 def _curve_through(rows: np.ndarray, nodes: int, rotation: float) -> np.ndarray:

@@ -6,7 +6,6 @@ from functools import cached_property
 from math import ceil, floor, gcd
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from .._checks import count, flag, interval
@@ -64,7 +63,7 @@ class Window:
         if self.cycle is None:
             raise ValueError(f"No periodic motion of the window {self.p}:{self.q} was found.")
         problem = self.equations.motion(self.cycle.p)
-        state = problem.unravel(jnp.asarray(self.equations.on_section(self.cycle, np.zeros(1))[0]))
+        state = problem.unravel(self.equations.on_section(self.cycle, np.zeros(1))[0])
         cycles = self.q * problem.cycles
         return find_orbit(problem.machine, state, cycles, method=problem.method, impact_log=16)
 

@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 
 from .._types import State
 from ..machine import own_modes, with_modes
-from .corrector import on_host, scaled_jacobian
+from .corrector import host_program, scaled_jacobian
 from .equations import Shooting
 from .tolerances import CORRECTED, ROUGHLY, ROUNDING
 
@@ -40,7 +40,7 @@ _TAIL = 0.8
 def in_lanes(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function of something shared and of rows, each an array of the host, for all rows
     of some arrays; so many at a time."""
-    program = on_host(lambda shared, *rows: jax.vmap(partial(function, shared))(*rows))
+    program = host_program(lambda shared, *rows: jax.vmap(partial(function, shared))(*rows))
 
     def call(shared: Any, *rows: np.ndarray) -> Any:
         count, parts = len(rows[0]), []

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from ..flow import guard_rates
 from ..machine import after_event, events_of, guard_of, jump_of, stops_of
-from .corrector import on_host
+from .corrector import host_program
 from .equations import Shooting
 from .flight import Event, Flight
 from .locate import bracketed_zero
@@ -123,7 +123,7 @@ def _modes_around_switch(problem: Shooting, machine, number, leg, s, u):
     return before, after_event(machine, number, s, problem.unravel(u), before)[1]
 
 
-@on_host
+@host_program
 def _fields_at_surface(problem: Shooting, x, number: int, leg, s, u):
     machine = problem.at(x)
     modes = _modes_around_switch(problem, machine, number, leg, s, u)
@@ -131,7 +131,7 @@ def _fields_at_surface(problem: Shooting, x, number: int, leg, s, u):
     return jnp.stack([flight.rate(s, u) for flight in flights])
 
 
-@on_host
+@host_program
 def _fly(problem: Shooting, x, number: int, leg, touching: bool, s0, s1, u):
     """Return the state at `s1` and the guard there, in contact or apart."""
     machine = problem.at(x)
@@ -202,7 +202,7 @@ class Touch(NamedTuple):
     """The change of the state by an impact, as a function of the depth."""
 
 
-@on_host
+@host_program
 def _turn_margins(problem: Shooting, x):
     """Return the distance of each turn, as a share of its size along the motion, and its clock;
     (legs, events, steps) each."""
@@ -243,7 +243,7 @@ def find_touches(
     return found
 
 
-@on_host
+@host_program
 def _at_touch(problem: Shooting, x, along, number: int, leg, s):
     """Return the state, ∂h, h and its rates, h's derivative in the parameter, ∂(dh/ds), the kick at
     a touch."""

@@ -20,7 +20,14 @@ from .._checks import count, from_host, given_number
 from .._messages import ReportProgress, at_work, warn
 from .._types import Vector
 from ..machine import nearest_images
-from .corrector import Step, advance, distance_along, on_host, step_error, steps_depend_on_motion
+from .corrector import (
+    Step,
+    advance,
+    distance_along,
+    host_program,
+    step_error,
+    steps_depend_on_motion,
+)
 from .edit_events import half_difference, repeats_from
 from .equations import Shooting
 from .from_orbit import with_finer_steps, with_grown_sizes
@@ -444,7 +451,7 @@ class Closing:
         return xs
 
 
-@on_host
+@host_program
 def _starts_with_rates(problem: Shooting, x, along):
     """Return the motion's other representations, each with its derivative along a direction."""
     return list(zip(*jax.jvp(partial(_other_starts, problem), (x,), (along,)), strict=True))

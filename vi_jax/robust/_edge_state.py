@@ -1,8 +1,6 @@
 """`edge_state`: the motion on the boundary between two basins, by edge tracking."""
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .._checks import count, flag
@@ -187,7 +185,7 @@ def _described(settling: Settling, section_states: list[Rows], orbit: Orbit | No
     else:
         late = rows[len(rows) // 4 :]
         kind = "chaotic" if _chaotic(settling.motion.near(late, late[-1:])) else "irregular"
-    sections = jax.vmap(settling.state)(jnp.asarray(rows))
+    sections = settling.state(rows)
     return EdgeState(orbit, kind, sections, settling.the_map.machine)
 
 

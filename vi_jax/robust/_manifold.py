@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Bool
 
@@ -110,7 +109,7 @@ def manifold(
     parts, lengths = ([saddle.place[None]], [saddle.place[None]]), [0.0, 0.0]
 
     def result() -> Manifold:
-        first, second = (jax.vmap(saddle.map.state)(saddle.states(part)) for part in parts)
+        first, second = (saddle.map.state(saddle.states(part)) for part in parts)
         return Manifold(orbit, which, (first, second), (lengths[0], lengths[1]), orbit.machine)
 
     found = lambda: result() if any(lengths) else None

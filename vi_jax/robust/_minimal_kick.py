@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._checks import count, flag, given_number, interval
+from .._checks import count, flag, given_number, interval, on_host
 from .._messages import at_work
 from .._types import State
 from ..flow import MethodLike
@@ -282,7 +282,7 @@ def _is_converged(change: float, last: float) -> bool:
 def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
     """Return section states of a saddle, and its left unstable unit eigenvector at each."""
     period = int(saddle.cycles)
-    rows = np.asarray(in_rows(saddle.sections))[:period]
+    rows = in_rows(on_host(saddle.sections))[:period]
     the_map = settling.the_map
     whole = cycle_map(the_map.machine, period, method=the_map.method)
     normals = []

@@ -12,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from .._checks import count, given_number
+from .._checks import count, given_number, on_host
 from .._messages import ReportProgress, silent
 from .._programs import compiled
 from .._types import State
@@ -25,6 +25,7 @@ from ..machine import (
     in_rows,
     is_autonomous,
     modes_of,
+    states_from_rows,
     without_modes,
 )
 from ..orbit import (
@@ -60,6 +61,9 @@ SAME = 1e-5
 RECORDED = 16
 
 
+_is_equilibrium = compiled(is_equilibrium)
+
+
 class Settling:
     """A classifier of starts by their return to a motion.
 
@@ -91,8 +95,8 @@ class Settling:
         """The number of starts judged so far, those at other clocks included."""
         return sum(self._judged_so_far)
 
-    def state(self, row: object) -> State:
-        return ravel_pytree(self.like)[1](jnp.asarray(row))
+    def state(self, rows: object) -> State:
+        return states_from_rows(self.like, rows)
 
     def judge(self, rows: Rows) -> Int[np.ndarray, " lanes"]:
         """Return `RETURNS`, `ELSEWHERE` or `INADMISSIBLE` for each start."""
@@ -197,14 +201,14 @@ class Settling:
         orbit = find_orbit(the_map.machine, self.state(row), cycles, method=the_map.method)
         if not bool(orbit.successful):
             return None
-        sections = np.asarray(in_rows(orbit.sections))
+        sections = in_rows(on_host(orbit.sections))
         return orbit if self.motion.between(row, sections).min() <= near else None
 
     def at_phase(self, start: Row, phase: float) -> tuple["Settling", Row]:
         """Return a classifier of starts `phase` after a section state of the motion, and that
         state."""
         machine, method = self.the_map.machine, self.the_map.method
-        if bool(is_equilibrium(machine, self.state(start), machine.cycle, self.motion.sizes)):
+        if bool(_is_equilibrium(machine, self.state(start), machine.cycle, self.motion.sizes)):
             raise ValueError("Argument `phase` must be 0 for an equilibrium, which does not move.")
         row = self.motion.states[self.motion.between(start, self.motion.states).argmin()]
         state, autonomous = self.state(row), is_autonomous(machine, self.like)
@@ -228,7 +232,7 @@ class Settling:
 
 
 def in_row(state: State) -> Row:
-    return np.asarray(in_rows(state, 0))
+    return in_rows(on_host(state), 0)
 
 
 def one_orbit(name: str, orbit: object) -> Orbit:
@@ -269,11 +273,11 @@ def settling_on(
                     f"Argument `{name}` must be an orbit of this machine, but its {other} is "
                     f"{of_orbit[other]:g}, not {numbers[other]:g}."
                 )
-        rows = np.asarray(in_rows(motion.sections))[: int(motion.cycles)]
+        rows = in_rows(on_host(motion.sections))[: int(motion.cycles)]
         return Settling(the_map, like, rows, settle, tolerance), rows[cycle % len(rows)]
     start = in_row(like)
     settling = Settling(the_map, like, start[None], settle, tolerance)
-    if bool(is_equilibrium(the_map.machine, like, the_map.machine.cycle, settling.motion.sizes)):
+    if bool(_is_equilibrium(the_map.machine, like, the_map.machine.cycle, settling.motion.sizes)):
         return settling, start
     rows = settling.settled_rows(start, longest)
     if rows is None:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import axes_of, count, fits_records, given_number
+from .._checks import axes_of, count, fits_records, given_number, on_host
 from .._messages import at_work, count_of, warning_once
 from .._types import State, xr
 from ..flow import (
@@ -381,7 +381,7 @@ class _Mapper:
         # The same number of cycles for all periods, for one compiled program.
         run = simulate(machine, start, self.longest, settle=settle, method=self.method)
         modes_there = np.reshape(run.modes, (-1, self.longest + 1)).T
-        return np.asarray(in_rows(run.sections))[1 : cycles + 1], modes_there[1 : cycles + 1]
+        return in_rows(on_host(run.sections))[1 : cycles + 1], modes_there[1 : cycles + 1]
 
 
 def _last_sections(
