@@ -168,6 +168,7 @@ def _simulate(plan: Plan, start: State, sampled: bool) -> Run:
     return failed_derivatives(collect(plan, sampled, *run_lane(plan, start)))
 
 
+@compiled
 def _errors(run: Run, tighter: Run) -> Errors:
     """Return the differences between a run and one by a tighter method; NaN if either failed."""
 

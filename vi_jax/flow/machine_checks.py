@@ -428,7 +428,7 @@ def _check_friction_forces(machine: AbstractMachine, start: State) -> None:
     """**Raises:** `ValueError` if the force of a friction is negative in the state of the start, at
     some instant of a cycle."""
     for number, friction in enumerate(switches_of(machine)):
-        if not isinstance(friction, DryFriction) or not (callable(friction.level) or friction.load):
+        if not (isinstance(friction, DryFriction) and friction.may_be_negative):
             continue
         try:
             with outside_of_traces():

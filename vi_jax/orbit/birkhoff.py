@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._checks import array_module
 from .._types import Number, Scalar
 from .tolerances import ROUNDING
 
@@ -31,10 +32,14 @@ _MOST = 16.0
 _LAGS, _FEWEST, _DIFFERS = 12, 64, 0.02
 
 
-def weights(number: int) -> np.ndarray:
-    """Return the weights of so many instants; their sum is 1."""
-    place = (np.arange(number) + 0.5) / number
-    weight = np.exp(-1 / (place * (1 - place)))
+def weights(number: int, count: Any = None) -> Any:
+    """Return the weights of the first `count` of so many instants, by default of all, and zeros;
+    their sum is 1. They are a NumPy array unless `count` is traced."""
+    count = number if count is None else count
+    array = array_module(count)
+    place = (np.arange(number) + 0.5) / count
+    inside = place < 1
+    weight = array.exp(-1 / array.where(inside, place * (1 - place), 1.0)) * inside
     return weight / weight.sum()
 
 
@@ -56,7 +61,7 @@ def agreement(rows: Float[Array, "sections states"], wander: Number = 0.0) -> Sc
     from `without_angles`; the `wander` of their method."""
     values = jnp.concatenate([rows, rows**2], axis=1)
     half = len(rows) // 2
-    difference = jnp.asarray(weights(half)) @ (values[:half] - values[half : 2 * half])
+    difference = weights(half) @ (values[:half] - values[half : 2 * half])
     return digits_of(difference, jnp.std(values, axis=0), jnp.mean(values, axis=0), wander)
 
 
@@ -90,7 +95,7 @@ def rotation_number(
         return jnp.full((), jnp.nan, rows.dtype)
     place, number = jnp.arange(len(rows)), (len(rows) - 1) // lag + 1
     counts, rows = (place < number)[:, None], rows[jnp.minimum(place * lag, len(rows) - 1)]
-    centred = jnp.where(counts, rows - _first_weights(len(rows), number) @ rows, 0.0)
+    centred = jnp.where(counts, rows - weights(len(rows), number) @ rows, 0.0)
     size = jnp.std(rows, axis=0, where=counts)
     moves = _moves(size, jnp.max(jnp.abs(rows), axis=0), wander)
     scaled = jnp.where(moves, centred / jnp.where(moves, size, 1.0), 0.0)
@@ -102,7 +107,7 @@ def rotation_number(
     gaps = jnp.diff(jnp.append(order, order[0] + 1))
     widest = jnp.argmax(gaps)
     cut = order[widest] + 0.5 * gaps[widest]
-    mean = _first_weights(len(steps), number - 1) @ jnp.mod(steps - cut, 1.0)
+    mean = weights(len(steps), number - 1) @ jnp.mod(steps - cut, 1.0)
     return jnp.where(jnp.any(moves), _up_to_half(mean + cut), jnp.nan)
 
 
@@ -120,11 +125,3 @@ def checked_rotation_number(rows: Float[Array, "sections states"], wander: Numbe
 def _up_to_half(turns: Array) -> Array:
     turns = jnp.mod(turns, 1.0)
     return jnp.minimum(turns, 1 - turns)
-
-
-def _first_weights(number: int, count: Any) -> Array:
-    """Return the `weights` of the first `count` of so many instants, and zeros."""
-    place = (jnp.arange(number) + 0.5) / count
-    inside = place < 1
-    weight = jnp.where(inside, jnp.exp(-1 / jnp.where(inside, place * (1 - place), 1.0)), 0.0)
-    return weight / weight.sum()

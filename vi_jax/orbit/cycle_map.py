@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from .._checks import count, from_host, require
 from .._messages import warning_once
+from .._programs import compiled
 from .._types import State
 from ..flow import (
     AbstractMethod,
@@ -123,8 +124,13 @@ class CycleMap(eqx.Module):
 
         Rows and columns are in the order of the state's leaves: Y, V, and W for a motor.
         """
-        x, unravel = raveled(map_state(self.machine, state))
-        return jax.jacfwd(lambda x: raveled(_end(self, unravel(x)))[0])(x)
+        return _jacobian(self, map_state(self.machine, state))
+
+
+@compiled
+def _jacobian(cycle_map: CycleMap, state: State) -> Float[Array, "states states"]:
+    x, unravel = raveled(state)
+    return jax.jacfwd(lambda x: raveled(_end(cycle_map, unravel(x)))[0])(x)
 
 
 @forward_jacobian

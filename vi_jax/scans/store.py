@@ -517,10 +517,10 @@ def _numbers(tree: Any) -> dict[str, Any]:
 
 
 def _variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
-    values = {name: jnp.zeros(4) + x[0] for name, x in blocks.axes.items()}
+    values = {name: np.zeros(4) + x[0] for name, x in blocks.axes.items()}
     if blocks.numbers is not None:
-        values[LANE] = jnp.zeros(4, jnp.uint32)
-    shapes = eqx.filter_eval_shape(program, values, jnp.ones(4, bool))
+        values[LANE] = np.zeros(4, np.uint32)
+    shapes = eqx.filter_eval_shape(program, values, np.ones(4, bool))
     known: dict[str, Mapping[str, Any]] = {
         "result": {
             "long_name": "how the lane ended",
