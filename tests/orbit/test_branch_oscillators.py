@@ -1,5 +1,6 @@
 """Compare branches of oscillators with closed forms, and of a motor with SciPy."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -116,3 +117,28 @@ def test_a_period_doubling_right_before_an_impact_is_lost():
         assert branch.multipliers[0, 0].real < -1e4 and not branch.stable[0]
         assert branch.to_xarray().stability[0] == "period_doubling"
         assert int(grazing.orbit.impacts) == 1 and grazing.orbit.multipliers[0].real < -1e4
+
+
+class Pressed(vi.Mechanical):
+    """A body that rubs on a wall, pressed on by a force that is least at t = π."""
+
+    q = ("x",)
+    mass = (1.0,)
+    press: float = 0.6
+    cycle = 2 * np.pi
+
+    def force(self, t, q, v):
+        return dict(x=-0.3 * q.x - 0.1 * v.x + 2 * jnp.cos(t - 1))
+
+    @property
+    def contacts(self):
+        return vi.DryFriction(0.3, on="x", load=lambda t, z: self.press + 0.5 * jnp.cos(t))
+
+
+def test_a_branch_ends_where_the_load_of_a_friction_becomes_negative():
+    machine = Pressed()
+    orbit = vi.find_orbit(machine, vi.simulate(machine, machine.at(), 1, settle=60).last)
+    branch = vi.continue_orbit(orbit, parameter="press", bounds=(0.45, 0.65))
+    assert branch.ends == ("jammed", "bounds")
+    # It is asked at steps of 2π/20 and shorter: at most 0.5 (1 - cos(π/20)) late.
+    assert 0.5 - 0.0062 < branch.parameter.min() <= 0.5 + 1e-9

@@ -308,9 +308,10 @@ class Branch(Curve):
     (it begins at a motion of half its period); by "symmetry-breaking" (it begins at a symmetric
     motion); by "hopf" (it shrinks to an equilibrium); by "rest" (a rest on a stop is lost or
     divided); by "closed" (its last point is its first one: an isola); by "multiplier" (another
-    multiplier becomes as large as a held one, or a held complex pair becomes real); by "stalled"
-    (no motion was found even with the smallest step); by "max_points"; by "interrupted"; or by
-    "long" (the period of an autonomous motion is four times the first one, for which the steps were
+    multiplier becomes as large as a held one, or a held complex pair becomes real); by "jammed"
+    (`level` or `load` of a dry friction becomes negative at a step of the motion); by "stalled" (no
+    motion was found even with the smallest step); by "max_points"; by "interrupted"; or by "long"
+    (the period of an autonomous motion is four times the first one, for which the steps were
     chosen: begin another branch there).
     """
 

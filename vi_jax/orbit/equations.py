@@ -44,6 +44,7 @@ from ..machine import (
     section_number,
     states_from_rows,
     stops_of,
+    switches_of,
     with_component,
     with_leaf,
 )
@@ -80,6 +81,9 @@ class Observed(NamedTuple):
     """The least extremum of the force on a resting body; its `margin` is that force."""
     modes_agree: Scalar
     """1 if each event puts its switch into the mode of its leg, else -1."""
+    least_load: Scalar
+    """The least size of a dry friction's force at a step of a flight, as a share of its greatest; 1
+    if none can be negative."""
     order_margin: Scalar
     """Margin until the order of events changes. It is the least time between consecutive events, or
     the least distance at an event to one that does not occur there. Negative if the machine does
@@ -585,15 +589,18 @@ class Shooting(eqx.Module):
             h = (s1 - begin.s) / self.steps
             flight = self.flight(machine, leg)
             sizes = self.guard_sizes(flight, s0, after)
+            load = self._least_load(flight, path)
             turns = turns_of(Path(flight, path[0], path[1], h, not self.events), sizes)
             largest = jnp.max(jnp.abs(path[1]), axis=0)
-            return matrix, integrals, approach, agree, turns, positions, largest, begin, sizes
+            margins = agree, load
+            return matrix, integrals, approach, margins, turns, positions, largest, begin, sizes
 
         legs = jnp.arange(len(states))
         next_clock, _ = self.parts(x if following is None else following)
         ends = self.ends(clock, self.period(x), next_clock)
         found = jax.vmap(follow)(legs, clock, ends, states)
-        matrix, integrals, approach, agree, turns, positions, largest, begin, sizes = found
+        matrix, integrals, approach, margins, turns, positions, largest, begin, sizes = found
+        agree, load = map(jnp.min, margins)
         monodromy = jnp.eye(self.states, dtype=x.dtype)
         for leg in range(len(states)):
             monodromy = matrix[leg] @ monodromy
@@ -621,7 +628,8 @@ class Shooting(eqx.Module):
             y_max=jnp.maximum(jnp.max(Y), jnp.max(high)),
             nearest=nearest,
             pull=pull._replace(unit=pull.unit / self.sizes[0] ** 2),
-            modes_agree=jnp.min(agree),
+            modes_agree=agree,
+            least_load=load,
             order_margin=reduce(jnp.minimum, times_left, order_of_events),
             duration=time if timed else jnp.asarray(cycle_time(machine), x.dtype) * self.cycles,
             averages=means(totals, time),
@@ -741,6 +749,20 @@ class Shooting(eqx.Module):
         approach = self._for_event(leg, approach_speed, u, rate)
         unit = (jnp.abs(slope) @ self.sizes[1:]) / self.sizes[0] + jnp.abs(s_slope)
         return jacobian + jnp.outer(after - jacobian @ before, slope) / rate, approach, unit
+
+    def _least_load(self, flight: Flight, path: tuple[Array, Array]) -> Scalar:
+        """Return `Observed.least_load` of a flight; `path`: clock and state at its steps."""
+        least = jnp.ones((), path[1].dtype)
+        for i, friction in enumerate(switches_of(flight.machine)):
+            if isinstance(friction, DryFriction) and friction.may_be_negative:
+                force = lambda s, u, i=i, x=friction: jnp.asarray(
+                    x.sliding(flight.machine, s, flight.unravel(u), flight.modes[i])
+                )
+                forces = jax.vmap(force)(*path)
+                largest = jnp.max(jnp.abs(forces))
+                share = jnp.min(forces) / jnp.where(largest > 0, largest, 1.0)
+                least = jnp.minimum(least, jnp.where(largest > 0, share, 1.0))
+        return least
 
     def _modes_agree(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
         """Return 1 if the event that begins a leg puts its switch into the leg's mode, else -1."""

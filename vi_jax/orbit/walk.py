@@ -33,7 +33,7 @@ from .equations import Shooting
 from .from_orbit import with_finer_steps, with_grown_sizes
 from .locate import locate_zero
 from .special import Point
-from .tolerances import CORRECTED, EXACT, FAINT, LOCATED, NEARBY, ROUGHLY, SAME
+from .tolerances import CORRECTED, EXACT, FAINT, LOCATED, NEARBY, ROUGHLY, ROUNDING, SAME
 
 # Reasons to end of every curve: Ctrl-C was pressed, the corrector fails, the curve closes, a bound.
 INTERRUPTED, STALLED, CLOSED, BOUNDS = "interrupted", "stalled", "closed", "bounds"
@@ -351,7 +351,9 @@ def bound_rows(table: Table) -> list[Event]:
         return Event(distance, ending)
 
     intervals = enumerate(table.bounds, -len(table.bounds))
-    return [row(i, *end) for i, (low, high) in intervals for end in ((low, 1.0), (high, -1.0))]
+    rows = [row(i, *end) for i, (low, high) in intervals for end in ((low, 1.0), (high, -1.0))]
+    load = lambda step: float(step.observed.least_load) + ROUNDING
+    return [*rows, Event(load, lambda at: Ending(at, "jammed"))]
 
 
 # A curve is away from its first point beyond so many lengths of its step, else near it: a choice.
