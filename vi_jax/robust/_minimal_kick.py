@@ -256,7 +256,7 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
     place = int(distances[near[0]].argmin())
 
     def edge(z: Kicks, cycles: int) -> tuple[Row, Kicks]:
-        numbers = (jnp.asarray(x) for x in (kick.rows(z), cycles, settling.begin))
+        numbers = map(np.asarray, (kick.rows(z), cycles, settling.begin))
         ends, jacobian = images(settling.the_map, settling.like, *numbers)
         slope = normals[place] @ np.asarray(jacobian)[:, :, list(kick.places)]
         offsets = settling.motion.near(np.asarray(ends), rows[place]) - rows[place]

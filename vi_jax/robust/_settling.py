@@ -134,7 +134,7 @@ class Settling:
     ) -> list[np.ndarray]:
         """Return states so many cycles later, whether they got there, and whether the start is
         invalid. Only states are compared, so their modes must be those of a motion from there."""
-        numbers = (jnp.asarray(x) for x in (rows, cycles, wanted, begin))
+        numbers = map(np.asarray, (rows, cycles, wanted, begin))
         *found, other = (np.asarray(x) for x in _advanced(self.the_map, self.like, *numbers))
         _refuse_other_modes(other)
         return found
@@ -161,7 +161,7 @@ class Settling:
         """Return the section states of some motions, from their starts on."""
         parts, last, begin = [rows[:, None]], rows, self.begin
         for _ in range(math.ceil(cycles / RECORDED)):
-            later = _sections_of(self.the_map, self.like, jnp.asarray(last), jnp.asarray(begin))
+            later = _sections_of(self.the_map, self.like, last, np.asarray(begin))
             parts.append(np.asarray(later)[:, 1:])
             last, begin = parts[-1][:, -1], 0.0
         return np.concatenate(parts, axis=1)[:, : cycles + 1]
@@ -227,7 +227,7 @@ class Settling:
             observed = machine.observed_every(phase)
             run = simulate(observed, state, 1, method=method, record="sections")
             return self, in_row(without_modes(run.last))
-        state_row = _state_at_clock(self.the_map, self.like, jnp.asarray(row), jnp.asarray(phase))
+        state_row = _state_at_clock(self.the_map, self.like, row, np.asarray(phase))
         return self.starting_at(phase), np.asarray(state_row)
 
 
