@@ -37,7 +37,6 @@ from ..machine import (
     cycle_time,
     events_of,
     guard_of,
-    is_autonomous,
     jump_of,
     mode_number,
     nearest_images,
@@ -188,6 +187,8 @@ class Shooting(eqx.Module):
     conditions: tuple[Any, ...] = ()
     """Additional equations (`AbstractCondition`); on a curve one fewer than there are parameters.
     """
+    autonomous: bool = eqx.field(static=True, kw_only=True)
+    """True if the period is an unknown: `is_autonomous`, which takes 1 ms."""
 
     @property
     def legs(self) -> int:
@@ -202,11 +203,6 @@ class Shooting(eqx.Module):
     def states(self) -> int:
         """Number of components of the state, as unknowns."""
         return sum(jnp.size(x) for x in jtu.tree_leaves(self.like))
-
-    @property
-    def autonomous(self) -> bool:
-        """True if the period is an unknown."""
-        return is_autonomous(self.machine, self.like)
 
     @property
     def omits_sections(self) -> bool:

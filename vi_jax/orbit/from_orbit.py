@@ -216,7 +216,10 @@ def equations_along(
     cycles_needed = longest_leg(clocks, events, period, cycles)
     like = without_modes(state)
     steps = steps_of(method, corners, like, cycles_needed)
-    blank = Shooting(machine, method, like, cycles, (), (), steps, parameters)
+    blank = Shooting(
+        machine, method, like, cycles, (), (), steps, parameters,
+        autonomous=is_autonomous(machine, like),
+    )  # fmt: skip
     states, modes = _follow_events(blank, state, found, period)
     _check_instants(blank, found, states, modes)
     while steps_depend_on_motion(blank) and 2 * blank.steps <= _MOST:
@@ -509,7 +512,7 @@ def resting_problem_of(
     order, steps = tuple(event for _, event in events), steps_of(stepper, corners, state, cycles)
     problem = Shooting(
         machine, stepper, state, cycles, order, ((),) * max(1, len(events)), steps, (parameter,),
-        held=_contact(machine, state, order),
+        held=_contact(machine, state, order), autonomous=autonomous,
     )  # fmt: skip
     clock = np.array([place for place, _ in events])
     earlier = _EARLIER * begins[-1] / cycles
