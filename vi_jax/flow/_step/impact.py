@@ -47,7 +47,7 @@ from ..plan import Plan
 from ..results import EventKind
 from ..smooth import SmoothMachine, hold_contacts, in_modes, stops_are_exact
 from .event_derivatives import FlowToEvent
-from .roots import force_rate, rate_of_position, rates
+from .roots import force_rate, force_rounding, rate_of_position, rates
 from .trial import AppliedStep
 
 # Number of roundings by which a rebound may be faster than the approach: a choice, a few more than
@@ -617,12 +617,16 @@ def _remaining_chatter(
     # The force on a body at rest, which has no damping by its velocity.
     at_rest = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
     pressing = sign * rates(free.field, body, s, at_rest).a
+    growth = sign * force_rate(free, body, free, s, at_rest)
+    if len(limited_in(plan.machine)) > 1:
+        least = force_rounding(free.field, body, s, at_rest)
+        pressing = jnp.where(jnp.abs(pressing) > least, pressing, 0.0)
+        growth = jnp.where(jnp.abs(growth) * plan.unit > least, growth, 0.0)
     force = pressing * (1 - impact.share)
     ends = force > 0
     time = jnp.where(ends, 2 * speed / jnp.where(ends, force, 1.0), jnp.inf)
     height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
-    growth = force_rate(free, body, free, s, at_rest)
-    not_yet, hop, wait = _time_until_pressed(speed, pressing, sign * growth)
+    not_yet, hop, wait = _time_until_pressed(speed, pressing, growth)
     height = jnp.where(not_yet, speed * hop - 0.5 * pressing * hop * hop, height)
     size = plan.extent(k) + jnp.abs(gap)
     time = jnp.where(not_yet, wait, time)
