@@ -607,19 +607,18 @@ def stop_bodies(
 
 def _remaining_chatter(
     plan: Plan, free: SmoothMachine, k: int, impact: ImpactResult, speed: Scalar, lane: Lane,
-    distance: Scalar | float = 0.0,
+    distance: Scalar | float = 0.0, least: Scalar | None = None,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Return whether an impact is one of the endless last ones before rest, and the time they take.
     `speed` is that of the rebound with respect to s; `distance` is that from the stop, if the
-    contact is only nearly closed."""
+    contact is only nearly closed. Forces up to `least` are rounding."""
     s, state, body = lane.s, lane.state, plan.machine.coordinates[k]
     sign, gap = plan.sign_and_gap(k, impact.contact)
     # The force on a body at rest, which has no damping by its velocity.
     at_rest = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
     pressing = sign * rates(free.field, body, s, at_rest).a
     growth = sign * force_rate(free, body, free, s, at_rest)
-    if len(limited_in(plan.machine)) > 1:
-        least = force_rounding(free.field, body, s, at_rest)
+    if least is not None:
         pressing = jnp.where(jnp.abs(pressing) > least, pressing, 0.0)
         growth = jnp.where(jnp.abs(growth) * plan.unit > least, growth, 0.0)
     force = pressing * (1 - impact.share)
@@ -701,10 +700,11 @@ def _resting_bodies(
     slips = _slips_after(plan, lane, at_event) if has_contact_friction(machine) else {}
     most = len(impacts) + len(slips)
     free = in_modes(plan.machine, lane.modes)
-    speeds = {}
+    speeds, least = {}, {}
     closed = list(contact)
     for k, hit in impacts.items():
         sign, _ = plan.sign_and_gap(k, hit.contact)
+        least[k] = force_rounding(free.field, plan.machine.coordinates[k], s, state)
         rate = -sign * rates(free.field, plan.machine.coordinates[k], s, state).v
         speeds[k] = jnp.where(distances[k] > 0, jnp.abs(rate), jnp.maximum(rate, 0.0))
         stays = (hit.contact > 0) & (stop_gradient(hit.share) <= _CLOSED)
@@ -724,7 +724,7 @@ def _resting_bodies(
             )
             hit = hit._replace(share=jnp.minimum(hit.share, law))
             ends, time = _remaining_chatter(
-                plan, free_k, k, hit, speeds[k], lane, distance=distances[k]
+                plan, free_k, k, hit, speeds[k], lane, distance=distances[k], least=least[k]
             )
             spare = held[k] < 0  # it rests when those rest that hold it
             time = jnp.where(spare, 0.0, time)
