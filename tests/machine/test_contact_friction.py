@@ -169,3 +169,58 @@ def test_friction_on_a_stop_and_dry_friction_release_a_body_together():
     other = vi.simulate(one, one.at(x=0.2), 2)
     np.testing.assert_allclose(run.sections.x, other.sections.x, atol=1e-10)
     np.testing.assert_allclose(run.sections.v.x, other.sections.v.x, atol=1e-10)
+
+
+class Falling(vi.Mechanical):
+    """Three blocks that touch one another, above a floor."""
+
+    masses: object = None
+    restitution: object = 0.0
+    q = ("x0", "y0", "x1", "y1", "x2", "y2")
+    cycle = 0.25
+
+    def mass(self, q):
+        return tuple(self.masses[i // 2] for i in range(6))
+
+    @property
+    def contacts(self):
+        def between(axis, i):
+            return lambda q: getattr(q, f"{axis}{i}") - (getattr(q, f"{axis}{i - 1}") if i else 0)
+
+        return tuple(
+            vi.RigidStop(
+                0.0, self.restitution, "left", on=between("y", i), friction=0.3 + 0.2 * i,
+                along=between("x", i),
+            )
+            for i in range(3)
+        )  # fmt: skip
+
+    def force(self, t, q, v):
+        return {
+            f"{axis}{i}": g * self.masses[i]
+            for axis, g in dict(x=0, y=-9.81).items()
+            for i in range(3)
+        }
+
+
+def test_bodies_that_touch_fall_together_without_a_force():
+    """Rounding of a force that is zero pressed one on another and released its friction, without
+    end. Two bodies move on as one, and all are at rest on the floor in the end."""
+
+    def one(masses, restitution, height):
+        falling = Falling(masses, restitution)
+        start = falling.at(y0=height, y1=height, y2=height, v=dict(x0=0.1, x1=0.1, x2=0.4))
+        return vi.simulate(falling, start, 6)
+
+    masses = jnp.asarray(np.random.default_rng(3).uniform(0.3, 3.0, (24, 3)))
+    cases = jnp.tile(jnp.asarray([0.0, 0.3]), 12), jnp.repeat(jnp.asarray([0.02, 0.5]), 12)
+    run = jax.vmap(one)(masses, *cases)
+    assert bool(run.successful.all())
+    first = jax.tree.map(lambda x: x[12:, 1], run.sections)  # still in the air
+    for i, slip in enumerate((0.1, 0.1, 0.4)):
+        expected = 0.5 - 0.5 * 9.81 * Falling.cycle**2
+        np.testing.assert_allclose(getattr(first, f"y{i}"), expected, atol=1e-13)
+        np.testing.assert_allclose(getattr(first, f"x{i}"), slip * Falling.cycle, atol=1e-13)
+    for i in range(3):
+        place, speed = getattr(run.last, f"y{i}")[:, None], getattr(run.last.v, f"y{i}")[:, None]
+        np.testing.assert_allclose(jnp.hstack([place, speed]), 0, atol=1e-12)

@@ -319,6 +319,23 @@ def test_a_third_foot_comes_to_rest_with_two_others():
     np.testing.assert_allclose(found, expected, atol=1e-10)
 
 
+@pytest.mark.slow
+def test_feet_rest_with_the_friction_of_another():
+    """One foot has the friction of all. When another was tested for rest without that foot, no
+    friction held the body, nothing pressed the foot on, and it bounced on for ever."""
+
+    def one(mu, size, tilt):
+        body = Feet(mu=mu, size=size, feet=(-0.25, 0.0, 0.25), restitution=0.3)
+        start = body.at(y=0.5 + 0.25 * tilt, tilt=tilt)
+        return vi.simulate(body, start, 3, max_impacts=2000)
+
+    cases = jnp.array([(0.9154, 0.5248, 0.0281), (0.7814, 3.0197, 0.012), (0.8044, 1.4187, 0.0252)])
+    run = jax.jit(jax.vmap(one))(*cases.T)
+    assert bool(run.successful.all())
+    assert int(run.impacts[:, 2].max()) == 0  # it has rocked to rest
+    np.testing.assert_allclose(run.last.tilt, 0.0, atol=1e-12)
+
+
 class Shaken(Block):
     """A block on a floor that is shaken; its corners rest from the start."""
 

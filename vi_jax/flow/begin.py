@@ -23,7 +23,7 @@ from ..machine import (
     struck_modes,
     switches_of,
 )
-from ._step.roots import Rates, force_rate, rates
+from ._step.roots import Rates, force_rate, force_rounding, rates
 from .lane import Lane, to_event, total
 from .plan import Plan
 from .results import code
@@ -55,7 +55,10 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     contact = None
     if plan.rests:
         jerks = [force_rate(free, x, free, s, start) for x in machine.coordinates]
-        contact, touching = _contacts_at(plan, start, current, jerks)
+        least = [zero for _ in jerks]
+        if is_compound(machine):
+            least = [force_rounding(free.field, x, s, start) for x in machine.coordinates]
+        contact, touching = _contacts_at(plan, start, current, jerks, least)
         direction = tuple(
             jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), sign)
             for x, j, sign in zip(current, jerks, direction, strict=True)
@@ -101,16 +104,16 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
 
 
 def _contacts_at(
-    plan: Plan, start: State, current: list[Rates], jerks: list[Scalar]
+    plan: Plan, start: State, current: list[Rates], jerks: list[Scalar], forces: list[Scalar]
 ) -> tuple[Scalars, tuple[Flag, ...]]:
     """Return the stops on which the coordinates rest, and for each coordinate whether no force
     presses it on its stop. By their rates and those of the forces they are pressed on, or about to
     be by a force that grows. Of several contacts all that touch are returned: another body may
     press on them, and `pressed_contacts` decides. Positions and velocities are known to the
-    rounding of a search that ends there.
+    rounding of a search that ends there, forces to those of `forces`.
     """
-    machine, found, touching = plan.machine, [], []
-    for k, (here, jerk) in enumerate(zip(current, jerks, strict=True)):
+    machine, found, touching, any_pressed = plan.machine, [], [], jnp.zeros((), bool)
+    for k, (here, jerk, force) in enumerate(zip(current, jerks, forces, strict=True)):
         eps = float(jnp.finfo(here.x.dtype).eps)
         (slack, slow), least = plan.rounding_bounds(k, start), 4 * eps * plan.extent(k)
         if not stops_are_exact(machine, start):
@@ -118,12 +121,16 @@ def _contacts_at(
             slow = jnp.maximum(slow, 4 * eps * machine.cycle * jnp.abs(here.a))
         slack, slow = jnp.maximum(slack, least), jnp.maximum(slow, least / plan.unit)
         rests, pressed = {}, jnp.zeros((), bool)
+        is_free = jnp.abs(here.a) <= force
         for i in stops_on(machine, k):
             stop = stops_of(machine)[i]
             stands = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slow)
-            pushes = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * jerk > 0)
+            pushes = stop.sign * here.a > force
+            pushes = pushes | is_free & (stop.sign * jerk * plan.unit > force)
             pressed = pressed | stands & pushes
             rests[i] = stands if is_compound(machine) else stands & pushes
         found.append(chosen_stop(machine, k, rests, jnp.zeros_like(here.x)))
-        touching.append((here.a == 0) & ~pressed)
+        touching.append(is_free & ~pressed)
+        any_pressed = any_pressed | pressed
+    found = [jnp.where(x & ~any_pressed, 0.0, y) for x, y in zip(touching, found, strict=True)]
     return tuple(found), tuple(touching)

@@ -20,6 +20,7 @@ from ..machine import (
     added,
     constrained_rate,
     field_in,
+    frictions_in,
     has_contact_friction,
     holds_anywhere,
     limited_in,
@@ -106,6 +107,10 @@ def hold_contacts(
     if contact is None or (but is not None and len(contact) == 1):
         return in_modes(machine, modes)
     others = (x if j != but else jnp.zeros_like(x) for j, x in enumerate(contact))
+    frictions = frictions_in(machine)
+    if but is not None and len(frictions) > 1:  # a redundant one may hold without it
+        free = lambda x: jnp.where(jnp.abs(x) == 0.25, 0.0, x)
+        modes = tuple(free(x) if i in frictions else x for i, x in enumerate(modes))
     return SmoothMachine(machine, modes, tuple(others))
 
 

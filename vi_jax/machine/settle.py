@@ -374,12 +374,13 @@ def _settled(x: Contacts, of: tuple[int, ...], found: _Decided) -> tuple[Settled
     # A slip without a force goes where it is accelerated.
     mode = jnp.where(~found.holds & (found.mode == 0), moves[n:], found.mode)
     kept = x.closed & (found.pushes | (moves[:n] <= 0))
-    spare, idle = x.closed & False, x.closed & False
+    spare, idle, force = x.closed & False, x.closed & False, found.force
     if n > 1 or x.slip.shape[0] > 1:
         pushes, acts, t = found.pushes, found.holds, len(of)
         if n:  # a contact that is about to open is not pushed, but for rounding
             own = _diagonal(x.gains)[:n]
             pushes = pushes & (own * found.force[:n] > _share(_OPENS, rate) * size)
+            force = found.force.at[:n].set(jnp.where(pushes, found.force[:n], 0.0))
         if of:  # a contact that is not pushed has no friction
             on = _normals(x, of)[:t] @ jnp.where(pushes, 1.0, jnp.zeros_like(rate[:n]))
             acts = acts.at[:t].set(acts[:t] & (on > 0))
@@ -394,7 +395,7 @@ def _settled(x: Contacts, of: tuple[int, ...], found: _Decided) -> tuple[Settled
         # Others hold a redundant friction, which keeps its largest force, or none.
         held = still & redundant[n:]
         mode = jnp.where(held, jnp.where(mode == 0, 0.25, 0.75 * mode), mode)
-    return Settled(found.force, rate, kept, spare, mode, found.code != SOLVED), idle
+    return Settled(force, rate, kept, spare, mode, found.code != SOLVED), idle
 
 
 def _decide_quickly(x: Contacts) -> _Decided:

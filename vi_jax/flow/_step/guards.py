@@ -250,6 +250,9 @@ def _is_slow(plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scala
     both could get to the stop in this time."""
     begin, end = ends
     slow = (jnp.abs(begin.v) <= jnp.abs(begin.a) * h) & (lane.direction[k] * end.v >= 0)
+    if not stops_are_exact(plan.machine, lane.state):  # bodies that fall together do not turn
+        eps = float(jnp.finfo(h.dtype).eps)
+        slow = slow & (jnp.abs(begin.a) * h * h > eps * (plan.extent(k) + jnp.abs(begin.x)))
     stops = [stop for stop in stops_of(plan.machine) if stop.coordinate == k]
     return slow & any_of(slow, (_reaches(x, begin, h) & _reaches(x, end, h) for x in stops))
 
@@ -354,6 +357,11 @@ def crossings(
     if plan.others(lane.state) or not stops_are_exact(machine, lane.state):
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
+        for i, stop in enumerate(stops_of(machine)):
+            place = machine.coordinates[stop.coordinate].position(new)
+            if not any(place is x for x in jtu.tree_leaves(new)):  # its terms may cancel
+                slack = plan.rounding_bounds(stop.coordinate, new)[0]
+                guards[i] = guards[i]._replace(slack=slack)
         guards = _with_own_rounding(plan, lane, (s1, new), guards)
         guards = [guard if guard.coordinate is not None else _mark_jump(guard) for guard in guards]
     return tuple(_landed(plan, lane, good & last, good, h, each, guards) for each in guards), below

@@ -47,7 +47,7 @@ from ..plan import Plan
 from ..results import EventKind
 from ..smooth import SmoothMachine, hold_contacts, in_modes, stops_are_exact
 from .event_derivatives import FlowToEvent
-from .roots import force_rate, rate_of_position, rates
+from .roots import force_rate, force_rounding, rate_of_position, rates
 from .trial import AppliedStep
 
 # Number of roundings by which a rebound may be faster than the approach: a choice, a few more than
@@ -607,22 +607,25 @@ def stop_bodies(
 
 def _remaining_chatter(
     plan: Plan, free: SmoothMachine, k: int, impact: ImpactResult, speed: Scalar, lane: Lane,
-    distance: Scalar | float = 0.0,
+    distance: Scalar | float = 0.0, least: Scalar | None = None,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Return whether an impact is one of the endless last ones before rest, and the time they take.
     `speed` is that of the rebound with respect to s; `distance` is that from the stop, if the
-    contact is only nearly closed."""
+    contact is only nearly closed. Forces up to `least` are rounding."""
     s, state, body = lane.s, lane.state, plan.machine.coordinates[k]
     sign, gap = plan.sign_and_gap(k, impact.contact)
     # The force on a body at rest, which has no damping by its velocity.
     at_rest = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
     pressing = sign * rates(free.field, body, s, at_rest).a
+    growth = sign * force_rate(free, body, free, s, at_rest)
+    if least is not None:
+        pressing = jnp.where(jnp.abs(pressing) > least, pressing, 0.0)
+        growth = jnp.where(jnp.abs(growth) * plan.unit > least, growth, 0.0)
     force = pressing * (1 - impact.share)
     ends = force > 0
     time = jnp.where(ends, 2 * speed / jnp.where(ends, force, 1.0), jnp.inf)
     height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
-    growth = force_rate(free, body, free, s, at_rest)
-    not_yet, hop, wait = _time_until_pressed(speed, pressing, sign * growth)
+    not_yet, hop, wait = _time_until_pressed(speed, pressing, growth)
     height = jnp.where(not_yet, speed * hop - 0.5 * pressing * hop * hop, height)
     size = plan.extent(k) + jnp.abs(gap)
     time = jnp.where(not_yet, wait, time)
@@ -697,10 +700,11 @@ def _resting_bodies(
     slips = _slips_after(plan, lane, at_event) if has_contact_friction(machine) else {}
     most = len(impacts) + len(slips)
     free = in_modes(plan.machine, lane.modes)
-    speeds = {}
+    speeds, least = {}, {}
     closed = list(contact)
     for k, hit in impacts.items():
         sign, _ = plan.sign_and_gap(k, hit.contact)
+        least[k] = force_rounding(free.field, plan.machine.coordinates[k], s, state)
         rate = -sign * rates(free.field, plan.machine.coordinates[k], s, state).v
         speeds[k] = jnp.where(distances[k] > 0, jnp.abs(rate), jnp.maximum(rate, 0.0))
         stays = (hit.contact > 0) & (stop_gradient(hit.share) <= _CLOSED)
@@ -720,7 +724,7 @@ def _resting_bodies(
             )
             hit = hit._replace(share=jnp.minimum(hit.share, law))
             ends, time = _remaining_chatter(
-                plan, free_k, k, hit, speeds[k], lane, distance=distances[k]
+                plan, free_k, k, hit, speeds[k], lane, distance=distances[k], least=least[k]
             )
             spare = held[k] < 0  # it rests when those rest that hold it
             time = jnp.where(spare, 0.0, time)

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 
 from ..._types import Flag, Scalar, Scalars, State
-from ...machine import Coordinate, horner
+from ...machine import Coordinate, horner, size_of
 from ..smooth import SmoothMachine
 
 # d(state)/ds as a function of s and the state.
@@ -58,6 +59,18 @@ def guard_rates(
 
     (x, v), (_, a) = jax.jvp(first, (s, state), (one, field(s, state)))
     return Rates(x, v, a)
+
+
+# A force on a body is rounding below this share of its terms: a choice, far above rounding.
+_CANCELS = 1e-9
+
+
+def force_rounding(field: Field, coordinate: Coordinate, s: Scalar, state: State) -> Scalar:
+    """Return the acceleration of a coordinate up to which it counts as zero: the forces on bodies
+    that fall together cancel."""
+    s, state = jax.lax.stop_gradient((s, state))
+    terms = size_of(coordinate.velocity, state, jtu.tree_map(jnp.abs, field(s, state)))
+    return max(_CANCELS, 64 * float(jnp.finfo(terms.dtype).eps)) * jax.lax.stop_gradient(terms)
 
 
 def force_rate(
