@@ -67,11 +67,15 @@ def with_delay_error(orbit: Orbit) -> Orbit:
         periods += int(min(np.log(SAME) / np.log(max(largest, 1e-3)), _MOST_PERIODS))
     own = chain._past.own(state)
     start = HybridState(own, modes_of(orbit.state) or (), history)
-    record = "motion" if is_autonomous(chain, state) else "sections"
+    hits = bool(jnp.any(orbit.impact_speed > 0))
+    record = "motion" if hits or is_autonomous(chain, state) else "sections"
     run = simulate(machine, start, periods * cycles, method=orbit.method, record=record)
     last, row = in_rows(run.sections)[-1], in_rows(own, 0)
     error = distance(last, row, row_sizes(chain, state)[: row.size])
     if run.duration is not None:  # on a section one number of the state is always the same
         duration = jnp.sum(run.duration[-cycles:])
         error = jnp.maximum(error, jnp.abs(duration / orbit.duration - 1))
+    if hits and run.impact_speed is not None:  # a body that rests on the section has no error there
+        fastest = jnp.max(run.impact_speed[-cycles:]) / jnp.nanmax(orbit.impact_speed)
+        error = jnp.maximum(error, jnp.abs(fastest - 1))
     return dataclasses.replace(orbit, delay_error=error)
