@@ -49,6 +49,12 @@ def test_error_of_a_body_that_rests_on_the_section_is_that_of_its_impact():
 
 
 @pytest.mark.slow
+def test_a_search_for_a_torus_takes_a_machine_with_delays():
+    with pytest.raises(ValueError, match="repeats after 1 cycle"):
+        vi.find_torus(Fed(gain=0.1, damping=0.2), settle=50, observed=600)
+
+
+@pytest.mark.slow
 def test_fold_of_a_branch():
     orbit = vi.find_orbit(Struck(), vi.simulate(Struck(), settle=30).last)
     branch = vi.continue_orbit(orbit, parameter="gain", bounds=(0.25, 0.9), progress=False)
