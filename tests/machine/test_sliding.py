@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,6 +61,38 @@ def test_sliding_ends_where_one_side_points_away():
     np.testing.assert_allclose(leaves, [np.arcsin(1 / a)], atol=1e-8)
     leaves = phases[kinds == 3][modes == -1.0]
     np.testing.assert_allclose(leaves, [np.pi + np.arcsin(1 / a)], atol=1e-8)
+
+
+class Moving(vi.AbstractMachine):
+    """x' = 0.3 - m, with the sign m of x - y(s). It slides while |0.3 - y'| < 1."""
+
+    c: Any = 1.0
+
+    @property
+    def events(self):
+        surface = lambda m, s, z: z.x - m.c * jnp.sin(s) + 0.2 * jnp.sin(2 * s)
+        return vi.Switch(surface, slides=True)
+
+    cycle = 2 * jnp.pi
+
+    def field(self, s, z, mode):
+        return dict(x=0.3 - mode)
+
+
+def test_sliding_on_a_moving_surface_ends_at_any_accuracy():
+    """The motion drifts off the surface by the error of the steps, to either side."""
+    c = jnp.linspace(0.8, 1.2, 12)
+    method = vi.Adaptive(diffrax.Tsit5(), rtol=1e-5)
+
+    def run(c):
+        found = vi.simulate(Moving(c), vi.State(x=-0.1), 1, event_log=4, method=method)
+        return found.successful, found.event_log
+
+    good, log = vi.jit(jax.vmap(run))(c)
+    assert good.all()
+    np.testing.assert_array_equal(log.value[:, 0, :2], np.tile([0.0, 1.0], (12, 1)))
+    leaves = np.arccos((c - np.sqrt(c**2 + 3.52)) / 1.6)  # y' = c cos s - 0.4 cos 2s = -0.7
+    np.testing.assert_allclose(log.phase[:, 0, 1], leaves, atol=1e-7)
 
 
 class Both(vi.AbstractMachine):

@@ -39,6 +39,22 @@ def test_orbit_with_an_impact_is_checked_by_the_whole_history():
 
 
 @pytest.mark.slow
+def test_error_of_a_body_that_rests_on_the_section_is_that_of_its_impact():
+    machine = Struck(gap=0.2, restitution=0.0)
+    run = vi.simulate(machine, settle=40)
+    orbit = vi.find_orbit(machine, run.last)
+    error = abs(float(run.impact_speed[0] / orbit.impact_speed[0]) - 1)
+    assert orbit.state.x == 0.2 and error > 1e-7
+    np.testing.assert_allclose(orbit.delay_error, error, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_search_for_a_torus_takes_a_machine_with_delays():
+    with pytest.raises(ValueError, match="repeats after 1 cycle"):
+        vi.find_torus(Fed(gain=0.1, damping=0.2), settle=50, observed=600)
+
+
+@pytest.mark.slow
 def test_fold_of_a_branch():
     orbit = vi.find_orbit(Struck(), vi.simulate(Struck(), settle=30).last)
     branch = vi.continue_orbit(orbit, parameter="gain", bounds=(0.25, 0.9), progress=False)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from matplotlib.figure import Figure
+from vi_jax.orbit.torus import _start_equations
 from vi_jax.orbit.torus_equations import _solve_bordered
 
 from kicked import SHEAR, TWIST, Alternating, Repelling, Ring, at, rotation_of
@@ -143,6 +144,20 @@ def test_motions_that_are_no_torus_are_refused():
         vi.find_torus(Ring(0.21, 1.4), at(0.3, 0.1))
     with pytest.raises(ValueError, match="`nodes` must be odd"):
         vi.find_torus(Ring(0.21, 0.1), at(0.3, 0.1), nodes=32)
+
+
+class Rubbed(vi.AbstractMachine):
+    cycle = 2 * jnp.pi
+    contacts = vi.DryFriction(0.1, on="u", mass=1.0)
+
+    def field(self, t, z):
+        return dict(x=z.u, u=jnp.cos(t) - 0.5 * z.x)
+
+
+def test_curves_with_different_events_are_refused():
+    rows, start = np.array([[0.0, 0.0], [0.0, 9.0]]), vi.State(x=0.0, u=0.0)
+    with pytest.raises(ValueError, match="same events in the same order"):
+        _start_equations(Rubbed(), vi.FixedStep(steps_per_cycle=24), start, 1, rows, 0.1)
 
 
 def test_the_elimination_of_unknowns_of_single_rows():

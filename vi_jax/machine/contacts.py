@@ -260,16 +260,24 @@ def on_held_surfaces(
     amounts = held.amounts(state, [-body.velocity(state) for body in held.coordinates])
     state = added(state, amounts, held.pushes)
     for i, switch in enumerate(switches_of(machine)):
-        if switch.blends:  # both fields lead to the same place of the surface
+        if switch.blends:
             both = ((*modes[:i], jnp.full_like(s, m), *modes[i + 1 :]) for m in (1.0, -1.0))
-            up, down = (stop_gradient(field_in(machine, s, state, x)) for x in both)
-            across = jtu.tree_map(jnp.subtract, up, down)
-            rates = (rate_of(switch.function, machine, s, state, x) for x in (up, down))
-            rate = jnp.subtract(*stop_gradient(tuple(rates)))
-            slides = (modes[i] == 0) & (rate != 0)
-            amount = -switch.function(machine, s, state) / jnp.where(slides, rate, 1.0)
-            state = added(state, (jnp.where(slides, amount, 0.0),), (across,))
+            flows = tuple(field_in(machine, s, state, x) for x in both)
+            state = on_surface(switch.function, machine, s, state, flows, modes[i] == 0)
     return state
+
+
+def on_surface(
+    function: Any, machine: Machine, s: Scalar, state: State, flows: tuple[State, State], when: Flag
+) -> State:
+    """Return a state near the surface on which a function vanishes, moved onto it along the
+    difference of the fields on both sides: both lead to the same place of the surface."""
+    up, down = stop_gradient(flows)
+    rates = (rate_of(function, machine, s, state, x) for x in (up, down))
+    rate = jnp.subtract(*stop_gradient(tuple(rates)))
+    when = when & (rate != 0)
+    amount = jnp.where(when, -function(machine, s, state) / jnp.where(when, rate, 1.0), 0.0)
+    return added(state, (amount,), (jtu.tree_map(jnp.subtract, up, down),))
 
 
 def shown_modes(machine: Machine, modes: Scalars) -> Scalars:

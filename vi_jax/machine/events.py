@@ -17,7 +17,7 @@ from jax.lax import stop_gradient
 
 from .._checks import one_of
 from .._types import Machine, Scalar, Scalars, State
-from .contacts import call_checked, field_in, impact_on, rate_of, shown_modes
+from .contacts import call_checked, field_in, impact_on, on_surface, rate_of, shown_modes
 from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
 from .friction import Friction, frictions_in, settled_modes
 from .leaves import size_of
@@ -257,14 +257,23 @@ class Switch(AbstractSwitch):
     def after(self, machine, s, state, mode, *, around: EventContext | None = None):
         if around is None:
             return state, -mode
-        up, down = self._rates(machine, s, state, around)
+        flows = self._flows(machine, s, state, around)
+        up, down = (rate_of(self.function, machine, s, state, x) for x in flows)
         slides = (mode != 0) & (up < 0) & (down > 0)
         leaves = jnp.where(up > -down, 1.0, -1.0)
+        # The error of steps along the surface would count as an event on the way off it.
+        state = on_surface(self.function, machine, s, state, flows, mode == 0)
         return state, jnp.where(slides, 0.0, jnp.where(mode == 0, leaves, -mode))
 
-    def _rates(self, machine: Machine, s: Scalar, state: State, around: EventContext) -> Scalars:
+    def _flows(
+        self, machine: Machine, s: Scalar, state: State, around: EventContext
+    ) -> tuple[State, State]:
         up, down = (field_in(machine, s, state, around.with_mode(mode)) for mode in (1.0, -1.0))
-        return tuple(rate_of(self.function, machine, s, state, x) for x in (up, down))
+        return up, down
+
+    def _rates(self, machine: Machine, s: Scalar, state: State, around: EventContext) -> Scalars:
+        flows = self._flows(machine, s, state, around)
+        return tuple(rate_of(self.function, machine, s, state, x) for x in flows)
 
 
 class Reset(AbstractEvent):

@@ -67,7 +67,8 @@ def with_delay_error(orbit: Orbit) -> Orbit:
         periods += int(min(np.log(SAME) / np.log(max(largest, 1e-3)), _MOST_PERIODS))
     own = chain._past.own(state)
     start = HybridState(own, modes_of(orbit.state) or (), history)
-    record = "motion" if is_autonomous(chain, state) else "sections"
+    hits = bool((np.asarray(orbit.impact_speed) > 0).any())
+    record = "motion" if hits or is_autonomous(chain, state) else "sections"
     run = simulate(machine, start, periods * cycles, method=orbit.method, record=record)
     last, row = in_rows(on_host(run.sections))[-1], in_rows(on_host(own), 0)
     sizes = sizes_on_host(chain, state, in_rows(on_host(state), 0))
@@ -75,6 +76,9 @@ def with_delay_error(orbit: Orbit) -> Orbit:
     if run.duration is not None:  # on a section one number of the state is always the same
         duration = np.asarray(run.duration)[-cycles:].sum()
         error = np.maximum(error, abs(duration / np.asarray(orbit.duration) - 1))
+    if hits and run.impact_speed is not None:  # a body that rests on the section has no error there
+        fastest = np.asarray(run.impact_speed)[-cycles:].max() / np.nanmax(orbit.impact_speed)
+        error = np.maximum(error, abs(fastest - 1))
     return dataclasses.replace(orbit, delay_error=from_host(error))
 
 

@@ -240,7 +240,7 @@ class Orbit(Summarized):
     delay_error: Float[Array, ""] | None = None
     """Of a machine with delays: the difference of the state from that of a run with the whole
     history, which a stable motion settles on, relative to the size of each component; or that of
-    the duration, relative to it, if it is larger."""
+    the duration or of the largest impact speed, relative to it, if it is larger."""
 
     @property
     @by_numpy_if_known

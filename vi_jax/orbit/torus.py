@@ -37,6 +37,7 @@ from ..machine import (
 )
 from .birkhoff import QUASIPERIODIC, agreement, rotation_number, weights, without_angles
 from .cycle_map import CycleMap, cycle_map, map_state
+from .delay import as_chain
 from .equations import Observed, Shooting
 from .from_orbit import (
     begins_after_jump,
@@ -320,7 +321,7 @@ def _start_equations(
     state, modes = without_modes(like), modes_of(like) or ()
     starts = [with_modes(states_from_rows(state, row), modes) for row in rows]
     problems, xs = zip(*(_followed(machine, method, s, cycles) for s in starts), strict=True)
-    problem, x = max(problems, key=lambda p: p.steps), np.stack(xs)
+    problem = max(problems, key=lambda p: p.steps)
     for i, other in enumerate(problems):
         if (other.events, other.modes) != (problem.events, problem.modes):
             raise ValueError(
@@ -329,6 +330,7 @@ def _start_equations(
                 "the curve grazes between them, or an event passes the section. In the second case "
                 "shift the section."
             )
+    x = np.stack(xs)
     if problem.events and begins_after_jump(machine, problem.events[0]):
         # Its state is that before the jump, which ends the motion from θ - ρ.
         states = slice(problem.legs, problem.legs + problem.states)
@@ -378,7 +380,7 @@ def find_torus(
     **Arguments:**
 
     - `machine`: a machine whose cycles end with its drive's, or at a section such as
-      `vi.turn_of`.
+      `vi.turn_of`. One with delays is replaced by `delay_chain(machine)`.
     - `start`: a state on the section, by default the machine's own start; a `Run`, whose last state
       is used; or a Neimark–Sacker `Point` of a branch, as for `point.switch()`.
     - `cycles`: the number of cycles after which the motion is on the same closed curve again: 2 if
@@ -404,6 +406,7 @@ def find_torus(
         raise ValueError(f"Argument `nodes` must be odd, but is {nodes}.")
     if rotation is not None:
         rotation = given_number("rotation", rotation, low=0.0, high=1.0)
+    machine, start = as_chain(machine, start.last if isinstance(start, Run) else start)
     machine = cycle_map(machine, cycles, method=method).machine
     method = torus_method(method, machine)
     start = machine.start() if start is None else start
@@ -429,7 +432,7 @@ def _settled(
     observed: int,
 ) -> Run:  # fmt: skip
     """Return the sections of so many periods of the motion on which a start settles."""
-    like = map_state(machine, start.last if isinstance(start, Run) else start, "start")
+    like = map_state(machine, start, "start")
     if machine.position(without_modes(like)).dtype != jnp.float64:
         raise ValueError(
             "Argument `start` must be of double precision: call "
