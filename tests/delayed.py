@@ -48,6 +48,7 @@ class Struck(Fed):
 class Masses(vi.Mechanical):
     """`Struck` as a machine of masses."""
 
+    gain: float = 0.3
     q = ("x",)
     mass = (1.0,)
     cycle = 2 * np.pi / 0.8
@@ -55,7 +56,7 @@ class Masses(vi.Mechanical):
     contacts = vi.RigidStop(0.6, 0.7, on="x")
 
     def force(self, t, q, v, past):
-        pull = 0.3 * (past.sensor.x - q.x)
+        pull = self.gain * (past.sensor.x - q.x)
         return dict(x=jnp.cos(0.8 * t) - q.x - 0.1 * v.x + pull)
 
 
