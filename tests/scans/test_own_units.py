@@ -13,7 +13,6 @@ from own_units import (
     Heater,
     Pair,
     Rubbed,
-    Struck,
     Valve,
     variants,
 )
@@ -22,7 +21,6 @@ pytestmark = pytest.mark.slow
 
 # Ranges of two components of the start, in the first units, at rest of the others.
 REGIONS = {
-    Struck: {"x": (-1, 0.5), "u": (-1, 1)},
     Heater: {"T": (290, 300)},
     Valve: {"x": (-2, 0.7), "u": (-1, 1)},
 }
