@@ -60,6 +60,30 @@ class Masses(vi.Mechanical):
         return dict(x=jnp.cos(0.8 * t) - q.x - 0.1 * v.x + pull)
 
 
+class Turning(vi.AbstractMachine):
+    """A tool that cuts the surface which it left one turn ago, and may leave the cut."""
+
+    stiffness: float = 0.3
+    turn: float = 8.0
+    feed: float = 1.0
+    damping: float = 0.03
+    before = vi.State(surface=0.0)
+    cycle = property(lambda self: self.turn)
+    delays = property(lambda self: dict(turn=self.turn))
+    events = vi.Switch(lambda m, t, z, past: m.feed + past.turn.surface - z.x)
+
+    def recorded(self, t, z, past, cuts):
+        return dict(surface=jnp.where(cuts > 0, z.x, past.turn.surface + self.feed))
+
+    def field(self, t, z, past, cuts):
+        chip = self.feed + past.turn.surface - z.x
+        force = jnp.where(cuts > 0, self.stiffness * chip, 0.0)
+        return dict(x=z.u, u=force - z.x - 2 * self.damping * z.u)
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
+
+
 def by_steps(
     rate: Callable[..., Any], start: Sequence[float], before: Callable[[float], Any],
     delays: Sequence[float], end: float, *, guard: Callable[..., float] | None = None,

@@ -12,7 +12,7 @@ import pytest
 import vi_jax as vi
 from vi_jax import lanes
 
-from delayed import Masses, Struck, by_steps, struck_by_steps
+from delayed import Masses, Struck, Turning, by_steps, struck_by_steps
 
 
 class Linear(vi.AbstractMachine):
@@ -26,30 +26,6 @@ class Linear(vi.AbstractMachine):
 
     def start(self):
         return vi.State(x=1.0)
-
-
-class Turning(vi.AbstractMachine):
-    """A tool that cuts the surface which it left one turn ago, and may leave the cut."""
-
-    stiffness: float = 0.3
-    turn: float = 8.0
-    feed: float = 1.0
-    damping: float = 0.03
-    before = vi.State(surface=0.0)
-    cycle = property(lambda self: self.turn)
-    delays = property(lambda self: dict(turn=self.turn))
-    events = vi.Switch(lambda m, t, z, past: m.feed + past.turn.surface - z.x)
-
-    def recorded(self, t, z, past, cuts):
-        return dict(surface=jnp.where(cuts > 0, z.x, past.turn.surface + self.feed))
-
-    def field(self, t, z, past, cuts):
-        chip = self.feed + past.turn.surface - z.x
-        force = jnp.where(cuts > 0, self.stiffness * chip, 0.0)
-        return dict(x=z.u, u=force - z.x - 2 * self.damping * z.u)
-
-    def start(self):
-        return vi.State(x=0.0, u=0.0)
 
 
 class Two(Struck):

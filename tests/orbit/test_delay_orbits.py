@@ -7,7 +7,7 @@ import pytest
 import vi_jax as vi
 from scipy.special import lambertw
 
-from delayed import Fed, Masses, Struck, by_steps
+from delayed import Fed, Masses, Struck, Turning, by_steps
 
 
 @pytest.fixture(scope="module")
@@ -181,24 +181,10 @@ def test_machines_without_delays_are_refused():
         vi.delay_chain(Undelayed())
 
 
-class Cutting(vi.AbstractMachine):
-    """A tool with dry friction, whose `recorded` has a mode."""
+class Cutting(Turning):
+    """The same with dry friction. Its `recorded` has a mode."""
 
-    cycle = 8.0
-    delays = property(lambda self: dict(turn=8.0))
-    before = vi.State(surface=0.0)
     contacts = vi.DryFriction(0.05, on="u", mass=1.0)
-    events = vi.Switch(lambda m, t, z, past: 1 + past.turn.surface - z.x)
-
-    def recorded(self, t, z, past, cuts):
-        return dict(surface=jnp.where(cuts > 0, z.x, past.turn.surface + 1))
-
-    def field(self, t, z, past, cuts):
-        force = jnp.where(cuts > 0, 0.3 * (1 + past.turn.surface - z.x), 0.0)
-        return dict(x=z.u, u=force - z.x - 0.06 * z.u)
-
-    def start(self):
-        return vi.State(x=0.0, u=0.0)
 
 
 @pytest.mark.slow
