@@ -48,6 +48,7 @@ class Struck(Fed):
 class Masses(vi.Mechanical):
     """`Struck` as a machine of masses."""
 
+    gain: float = 0.3
     q = ("x",)
     mass = (1.0,)
     cycle = 2 * np.pi / 0.8
@@ -55,8 +56,32 @@ class Masses(vi.Mechanical):
     contacts = vi.RigidStop(0.6, 0.7, on="x")
 
     def force(self, t, q, v, past):
-        pull = 0.3 * (past.sensor.x - q.x)
+        pull = self.gain * (past.sensor.x - q.x)
         return dict(x=jnp.cos(0.8 * t) - q.x - 0.1 * v.x + pull)
+
+
+class Turning(vi.AbstractMachine):
+    """A tool that cuts the surface which it left one turn ago, and may leave the cut."""
+
+    stiffness: float = 0.3
+    turn: float = 8.0
+    feed: float = 1.0
+    damping: float = 0.03
+    before = vi.State(surface=0.0)
+    cycle = property(lambda self: self.turn)
+    delays = property(lambda self: dict(turn=self.turn))
+    events = vi.Switch(lambda m, t, z, past: m.feed + past.turn.surface - z.x)
+
+    def recorded(self, t, z, past, cuts):
+        return dict(surface=jnp.where(cuts > 0, z.x, past.turn.surface + self.feed))
+
+    def field(self, t, z, past, cuts):
+        chip = self.feed + past.turn.surface - z.x
+        force = jnp.where(cuts > 0, self.stiffness * chip, 0.0)
+        return dict(x=z.u, u=force - z.x - 2 * self.damping * z.u)
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
 
 
 def by_steps(

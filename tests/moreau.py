@@ -5,6 +5,7 @@ fastest first, with the share of Newton's restitution that gains no energy. Then
 satisfy the conditions of contact for velocities. The error is of first order in the step.
 """
 
+import functools
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -32,6 +33,11 @@ def _gradients(functions: Callable[..., Any], q: np.ndarray) -> tuple[np.ndarray
     return values, np.stack(columns, 2)
 
 
+@functools.cache
+def _modes_of(n: int) -> np.ndarray:
+    return np.array(list(itertools.product([_OPEN, 0, 1, -1], repeat=n)))
+
+
 def _impulses(
     gains: np.ndarray, free: np.ndarray, mu: np.ndarray, active: np.ndarray
 ) -> np.ndarray:
@@ -39,7 +45,7 @@ def _impulses(
     contact: those of the set of modes that violates them least. Of equal sets it is the first, in
     which few contacts push."""
     n = mu.shape[1]
-    modes = np.array(list(itertools.product([_OPEN, 0, 1, -1], repeat=n)))
+    modes = _modes_of(n)
     pushes, sticks, slip = modes != _OPEN, modes == 0, np.where(modes == _OPEN, 0, modes)
     held = np.concatenate([pushes, sticks], 1)[None]
     # A set with linearly dependent rows is another one with fewer contacts.
@@ -71,22 +77,15 @@ def _without_gain(
     gains: np.ndarray, speeds: np.ndarray, inelastic: np.ndarray, full: np.ndarray
 ) -> np.ndarray:
     """Return the mean of two impulses (lanes, 2n) with the largest share θ of the second that gains
-    no energy, by bisection."""
-
-    def gain(share: np.ndarray) -> np.ndarray:
-        impulse = inelastic + share[:, None] * (full - inelastic)
-        mean = speeds + 0.5 * np.einsum("lij,lj->li", gains, impulse)
-        return np.einsum("li,li->l", impulse, mean)
-
-    low, high = np.zeros(len(gains)), np.ones(len(gains))
-    work = np.abs(np.einsum("li,li->l", full, speeds))
-    share = np.where(gain(high) <= 1e-12 * work, 1.0, 0.0)
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        gains_energy = gain(middle) > 0
-        low, high = np.where(gains_energy, low, middle), np.where(gains_energy, middle, high)
-    share = np.maximum(share, low)
-    return inelastic + share[:, None] * (full - inelastic)
+    no energy. The gain a + bθ + cθ² is not positive at θ = 0."""
+    change, middle = full - inelastic, speeds + 0.5 * np.einsum("lij,lj->li", gains, inelastic)
+    inner = lambda x, y: np.einsum("li,li->l", x, y)
+    a, c = inner(inelastic, middle), 0.5 * np.einsum("li,lij,lj->l", change, gains, change)
+    b = inner(change, middle) + 0.5 * np.einsum("li,lij,lj->l", inelastic, gains, change)
+    within = a + b + c <= 1e-12 * np.abs(inner(full, speeds))
+    root = np.sqrt(np.maximum(b * b - 4 * np.minimum(a, 0) * c, 0)) - b
+    share = np.where(within, 1.0, root / np.where(within, 1.0, 2 * c))
+    return inelastic + share[:, None] * change
 
 
 def rows_of(

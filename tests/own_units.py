@@ -296,11 +296,8 @@ def in_units(kind) -> Iterator[Any]:
     yield from (machine_of(kind, scales, time=time) for scales, time in units_of(kind))
 
 
-def variants(kind, *, order=False) -> Iterator[Any]:
-    """Yield a machine in several units, and if it is driven with another section and, if asked for,
-    in another order of contacts and events, which needs other programs."""
+def variants(kind) -> Iterator[Any]:
+    """Yield a machine in several units, and if it is driven with another section."""
     yield from in_units(kind)
     if kind.length is not None:
         yield machine_of(kind, phase=0.37)
-        if order:
-            yield machine_of(kind, is_flipped=True)

@@ -170,22 +170,16 @@ def test_a_ball_on_a_table_whose_motion_is_prescribed():
 
 
 @pytest.mark.slow
-def test_a_rest_on_a_moving_table_is_lost_where_that_in_the_distance_is():
-    """The distance has the rounding of two positions, which once ended branches too early."""
-
-    def found(machine, start):
-        last = vi.simulate(machine, start, 1, settle=50).last
-        orbit = vi.find_orbit(machine, last, impact_log=40, throw=True)
-        name = next(x for x in ("shaking", "acceleration") if hasattr(machine, x))
-        branch = vi.continue_orbit(orbit, parameter=name, bounds=(1.19, 1.4), progress=False)
-        return branch.ends, [(x.kind, x.parameter) for x in branch.special]
-
-    table = Table(shaking=1.2, restitution=0.7)
-    ball = vi.machines.BouncingBall(acceleration=1.2, restitution=0.7)
-    ends, special = found(table, table.at(ball=-1.2))
-    wanted_ends, wanted = found(ball, ball.start(height=0.0))
-    assert ends == wanted_ends and [x for x, _ in special] == [x for x, _ in wanted] == ["rest"]
-    np.testing.assert_allclose(special[0][1], wanted[0][1], atol=1e-9)
+def test_a_rest_on_a_moving_table_is_lost():
+    """The distance has the rounding of two positions, which once ended branches too early. The last
+    of the hops, summed up in closed form, ends as the table releases the ball again."""
+    table = Table(shaking=1.3, restitution=0.7)
+    last = vi.simulate(table, table.at(ball=-1.3), 1, settle=50).last
+    orbit = vi.find_orbit(table, last, impact_log=40, throw=True)
+    branch = vi.continue_orbit(orbit, parameter="shaking", bounds=(1.3, 1.4), progress=False)
+    (lost,) = branch.special
+    assert lost.kind == "rest" and branch.ends == ("bounds", "rest")
+    np.testing.assert_allclose(lost.parameter, 1.33596602013, rtol=0, atol=1e-9)
 
 
 class Pendulums(vi.Mechanical):

@@ -336,18 +336,10 @@ def test_feet_rest_with_the_friction_of_another():
     np.testing.assert_allclose(run.last.tilt, 0.0, atol=1e-12)
 
 
-class Shaken(Block):
-    """A block on a floor that is shaken; its corners rest from the start."""
-
-    cycle = 0.5
-
-    def force(self, t, q, v):
-        return dict(x=-6.0 * jnp.sin(4 * jnp.pi * t), y=-9.81, tilt=0.0)
-
-
 @pytest.mark.slow
 def test_a_corner_that_another_impact_lifts_is_released():
-    block = Shaken(mu=0.45)
+    """The corners rest from the start."""
+    block = Feet(mu=0.45, size=-6.0)
     log = vi.simulate(block, block.at(y=0.5), 4, event_log=16).event_log
     kinds, numbers = np.asarray(log.kind).ravel(), np.asarray(log.number).ravel()
     held = np.isin(kinds, [vi.EVENTS.index(x) for x in ("rest", "release")])

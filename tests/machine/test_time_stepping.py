@@ -32,16 +32,15 @@ class ShakenBlock(Block):
         return dict(x=-x, y=-9.81 - y, tilt=0.0)
 
 
-def simulated(kind, given, q, v):
-    """Return the place at the end of each lane, and whether its motion was completed."""
+def simulated(kind, given, q, v, found, cycles=1, max_impacts=4000):
+    """Return arrays `found(machine, run)` of each lane, and whether its motion was completed."""
 
     def one(given, q, v):
         machine = kind(**given)
-        names = machine.q
-        start = machine.at(**dict(zip(names, q, strict=True)), v=dict(zip(names, v, strict=True)))
-        run = vi.simulate(machine, start, 1, max_impacts=4000)
-        place = jnp.stack([getattr(run.last, x) for x in names])
-        return place, run.successful
+        place, speeds = (dict(zip(machine.q, x, strict=True)) for x in (q, v))
+        start = machine.at(**place, v=speeds)
+        run = vi.simulate(machine, start, cycles, max_impacts=max_impacts)
+        return *found(machine, run), run.successful
 
     numbers = jax.tree.map(jnp.asarray, (given, q, v))
     return [np.asarray(x) for x in jax.jit(jax.vmap(one))(*numbers)]
@@ -60,7 +59,8 @@ def compared(kind, given, gaps, places, mass, mu, q, v, weights):
     and steps of 3e-5 change their order (3 blocks). With restitution 1 no steps were short enough:
     three stacks that differed from 64,000 steps by 4e-4 to 2e-3 agree with SciPy to 6e-10.
     """
-    found, good = simulated(kind, given, q, v)
+    last = lambda machine, run: (jnp.stack([getattr(run.last, x) for x in machine.q]),)
+    found, good = simulated(kind, given, q, v, last)
     restitution = np.repeat(given["restitution"][:, None], mu.shape[1], 1)
     given = {**given, "mass": mass, "mu": mu, "restitution": restitution}
     error = np.full(len(q), np.inf)
@@ -151,17 +151,9 @@ def test_random_blocks_on_a_shaken_floor():
 @pytest.mark.slow
 def test_no_motion_on_a_floor_at_rest_gains_energy():
     given, q, v = random_blocks(np.random.default_rng(2), 120)
-    numbers = jax.tree.map(jnp.asarray, ({**given, "sizes": 0 * given["sizes"]}, q, v))
-
-    def one(given, q, v):
-        machine = ShakenBlock(**given, cycle=END / 16)
-        start = machine.at(
-            **dict(zip(machine.q, q, strict=True)), v=dict(zip(machine.q, v, strict=True))
-        )
-        run = vi.simulate(machine, start, 16, max_impacts=4000)
-        return jax.vmap(machine.energy)(run.sections), run.successful
-
-    energy, good = map(np.asarray, jax.jit(jax.vmap(one))(*numbers))
+    given = {**given, "sizes": 0 * given["sizes"], "cycle": np.full(120, END / 16)}
+    energies = lambda machine, run: (jax.vmap(machine.energy)(run.sections),)
+    energy, good = simulated(ShakenBlock, given, q, v, energies, 16)
     assert good.all()
     assert (np.diff(energy, axis=1) < 1e-9).all()
 
@@ -182,17 +174,11 @@ def test_blocks_on_three_feet_come_to_rest():
     given["restitution"] = np.minimum(given["restitution"], 0.7)
     given["sizes"][::2] = 0.0
 
-    def one(given, q, v):
-        machine = ThreeFeet(**given)
-        start = machine.at(
-            **dict(zip(machine.q, q, strict=True)), v=dict(zip(machine.q, v, strict=True))
-        )
-        run = vi.simulate(machine, start, 4, max_impacts=4000)
+    def found(machine, run):
         feet = [stop.on(run.last) for stop in machine.contacts]
-        return jax.vmap(machine.energy)(run.sections), jnp.stack(feet), run.successful
+        return jax.vmap(machine.energy)(run.sections), jnp.stack(feet)
 
-    numbers = jax.tree.map(jnp.asarray, (given, q, v))
-    energy, feet, good = map(np.asarray, jax.jit(jax.vmap(one))(*numbers))
+    energy, feet, good = simulated(ThreeFeet, given, q, v, found, 4)
     assert good.all(), np.flatnonzero(~good)
     assert feet.min() > -1e-9
     assert (np.diff(energy[::2], axis=1) < 1e-9).all()
@@ -327,16 +313,13 @@ def test_stacks_of_boxes_come_to_rest():
     slip, without acceleration yet, had the error of their sticking as a slip the other way."""
     given, q, v = random_boxes(np.random.default_rng(1), 160)
     some = np.array([20, 24, 22, 55, 59, 87, 95, 53])
-    numbers = jax.tree.map(lambda x: jnp.asarray(x[some]), (given, q, v))
 
-    def one(given, q, v):
-        boxes = Boxes(**given)
-        start = boxes.at(**dict(zip(boxes.q, q, strict=True)), v=dict(zip(boxes.q, v, strict=True)))
-        run = vi.simulate(boxes, start, 4, max_impacts=20_000)
+    def found(boxes, run):
         corners = [boxes.corner(run.sections, i, b)[0] for i in range(2) for b in (-1, 1)]
-        return jax.vmap(boxes.energy)(run.sections), jnp.stack(corners), run.successful
+        return jax.vmap(boxes.energy)(run.sections), jnp.stack(corners)
 
-    energy, corners, good = map(np.asarray, jax.jit(jax.vmap(one))(*numbers))
+    numbers = jax.tree.map(lambda x: x[some], (given, q, v))
+    energy, corners, good = simulated(Boxes, *numbers, found, 4, max_impacts=20_000)
     assert good.all()
     assert corners.min() > -1e-9
     at_rest = energy[some % 2 == 0]

@@ -174,7 +174,7 @@ def test_orders_and_kicks_of_soft_stops():
     prestress F0 the field jumps, and the body turns back with the acceleration a + F0. A dashpot
     that cannot pull gives an impulse of order y². A contact that is less deep than rounding is
     refused: regression, 5 % off at 1e9, and a damped one of another order."""
-    for stiffness in (1e9, 1e8, 30.0):
+    for stiffness in (1e9, 30.0):
         found = vi.grazing(soft_grazing(stiffness), check=False)
         assert found.order[0] == 1.5 and found.rate[0] == pytest.approx(SWING, rel=1e-9)
         impulse = -stiffness * 4 / 3 * np.sqrt(2 / SWING)

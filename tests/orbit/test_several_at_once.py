@@ -83,19 +83,18 @@ def monodromy(point):
 def test_each_bifurcation_of_two_oscillators_is_found():
     """Two multipliers of uncoupled, weakly coupled or slightly different oscillators pass 1 or -1
     within one step, so that no determinant changes its sign."""
-    one, weak, strong, unlike = (branch_of(*at) for at in ((0.0,), (0.003,), (0.01,), (0.0, 0.001)))
-    doublings = [places(branch, "period-doubling") for branch in (one, weak, strong, unlike)]
+    one, weak, unlike = (branch_of(*at) for at in ((0.0,), (0.003,), (0.0, 0.001)))
+    doublings = [places(branch, "period-doubling") for branch in (one, weak, unlike)]
     np.testing.assert_allclose(doublings[0], [0.19582944], atol=1e-8)
     np.testing.assert_allclose(doublings[1], [0.19582944, 0.19916897], atol=1e-8)
-    np.testing.assert_allclose(doublings[2], [0.19582944, 0.2070924], atol=1e-8)
-    np.testing.assert_allclose(doublings[3], [0.19563381, 0.19582944], atol=1e-8)
+    np.testing.assert_allclose(doublings[2], [0.19563381, 0.19582944], atol=1e-8)
     assert all("twice" in point.detail for point in one.special)
     fold = next(point for point in one.special if point.kind == "fold")
     with pytest.raises(ValueError, match="a fold of two motions at once"):
         vi.boundary(fold, parameter="omega", bounds=((0.02, 0.25), (1.0, 1.4)))
     assert len(places(one, "fold")) == len(places(weak, "fold")) == 2
     np.testing.assert_allclose(places(weak, "branch-point")[0], 0.08000716, atol=1e-8)
-    for branch in (one, weak, strong, unlike):
+    for branch in (one, weak, unlike):
         for point in branch.special:
             off = 1.0 if point.kind == "period-doubling" else -1.0
             values = np.linalg.eigvals(monodromy(point))

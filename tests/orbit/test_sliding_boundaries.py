@@ -56,7 +56,7 @@ def test_sticking_begins_on_den_hartogs_curve():
     branch = branch_of("level", bounds, omega=0.75, level=0.7 * limit)
     assert branch.ends == ("bounds", "crossing-sliding") and len(branch.problem.events) == 2
     (point,) = branch.special
-    sides = point, on_both_sides(point, "level", bounds)
+    sides = point, on_both_sides(point, "level", (0.95 * limit, 1.1 * limit))
     for side, words in zip(sides, ("beyond is held there", "no longer"), strict=True):
         assert side.kind == "crossing-sliding" and words in side.detail
         assert side.parameter == pytest.approx(limit, abs=1e-10)
