@@ -359,6 +359,25 @@ class FixedStop(Machine):
     contacts = vi.RigidStop(wall, 0.5)
 
 
+@pytest.mark.parametrize(
+    "verb",
+    [
+        lambda scene: vi.scan(scene, {"stops.0.gap": np.linspace(1, 2, 3)}),
+        lambda scene: vi.basins(scene, {"start.Y": (-1, 1), "start.V": (-1, 1)}),
+        lambda scene: vi.all_orbits(scene, 1, region={"start.Y": (-1, 1), "start.V": (-1, 1)}),
+        lambda scene: vi.find_torus(scene, settle=10),
+        lambda scene: vi.minimal_kick(scene),
+    ],
+)
+def test_a_verb_of_the_host_that_is_traced(verb):
+    def of_ratio(ratio):
+        return verb(vi.Scene.ideal(frequency_ratio=ratio))
+
+    for transform in (jax.grad, jax.jit):
+        with pytest.raises(TypeError, match="the `Scene` is being traced"):
+            transform(of_ratio)(0.9)
+
+
 def test_a_parameter_that_the_class_body_has_used():
     with pytest.warns(UserWarning, match="reads its parameter 'wall', which may have no effect"):
         vi.sweep(FixedStop(), "wall", [0.5, 0.6], start=FixedStop().start(), cycles=2, settle=1)

@@ -19,7 +19,7 @@ from jax import core
 from jax.core import Tracer
 from jaxtyping import Array, Bool
 
-from ._messages import warn
+from ._messages import P, R, warn
 
 
 class Range(NamedTuple):
@@ -433,6 +433,24 @@ def from_host(tree: Any) -> Any:
     each shape."""
     put = lambda x: x if isinstance(x, jax.Array) else jax.device_put(np.array(x))
     return jtu.tree_map(put, tree)
+
+
+def host_side(verb: Callable[P, R]) -> Callable[P, R]:
+    """Decorator: raise a `TypeError` if an argument is being traced. NumPy would raise one later,
+    which names no argument."""
+
+    @wraps(verb)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        for value in (*args, *kwargs.values()):
+            if any(isinstance(x, Tracer) for x in jtu.tree_leaves(value)):
+                raise TypeError(
+                    f"Arguments of `{verb.__name__}` must hold known numbers, but a number of the "
+                    f"`{type(value).__name__}` is being traced: call `{verb.__name__}` outside of "
+                    "`jit`, `vmap` and `grad`."
+                )
+        return verb(*args, **kwargs)
+
+    return checked
 
 
 def by_numpy_if_known(method: Callable[[Any], Any]) -> Callable[[Any], Any]:

@@ -11,11 +11,10 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from .._checks import count, require
+from .._checks import count, host_side, require
 from .._messages import warning_once
 from .._programs import compiled
 from .._types import Scalar, State
@@ -68,6 +67,7 @@ class Suggestion(NamedTuple):
         return "\n".join(lines)
 
 
+@host_side
 @warning_once
 def suggest_method(
     machine: AbstractMachine,
@@ -101,11 +101,6 @@ def suggest_method(
     require("error", error, low=0.0, open_low=True)
     cycles, lanes = count("cycles", cycles, least=1), count("lanes", lanes, least=1)
     machine = machine_of(machine)
-    if any(isinstance(x, Tracer) for x in jtu.tree_leaves((machine, start))):
-        raise TypeError(
-            "Arguments `machine` and `start` must hold known numbers, but are being traced: call "
-            "`suggest_method` outside of `jit`, `vmap` and `grad`."
-        )
     if start is None:
         start = machine.start()
     start = convert_start(machine, start)

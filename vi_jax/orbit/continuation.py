@@ -11,6 +11,7 @@ import numpy as np
 from .._checks import (
     flag,
     given_number,
+    host_side,
     instance_of,
     interval,
     one_of,
@@ -44,6 +45,7 @@ from .walk import check_walk, follow_both_ways, rescaled
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
 
+@host_side
 def continue_orbit(
     orbit: Orbit,
     *,
@@ -252,6 +254,7 @@ def _refine(problem: Shooting, x: np.ndarray, tangent: np.ndarray) -> tuple[Step
     return start, distance if bool(start.good) else np.inf
 
 
+@host_side
 def boundary(
     point: Point,
     *,

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from .._checks import count, flag, instance_of
+from .._checks import count, flag, host_side, instance_of
 from .._messages import at_work, count_of
 from ..flow import simulate
 from ..machine import Stated, Summarized, in_rows, in_unit, stated, stops_of
@@ -317,6 +317,7 @@ class Grazing(Summarized):
         return lines
 
 
+@host_side
 def grazing(
     point: Point, *, check: bool = True, periods: int = 12, progress: bool = True
 ) -> Grazing:

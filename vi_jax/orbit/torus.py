@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import count, given_number, instance_of
+from .._checks import count, given_number, host_side, instance_of
 from .._messages import count_of
 from .._programs import compiled
 from .._types import Scalar, State
@@ -359,6 +359,7 @@ def torus_of(solved: Solved, equations: Equations) -> Torus:
     return Torus(equations.motion(solved.curve.p), solved.curve._replace(p=np.zeros(0)))
 
 
+@host_side
 def find_torus(
     machine: AbstractMachine,
     start: Any = None,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .._checks import count, flag, interval
+from .._checks import count, flag, host_side, interval
 from .._messages import ReportProgress, at_work
 from ..machine import check_leaf, in_unit, leaf, units_of
 from .find import find_orbit
@@ -140,6 +140,7 @@ class TorusBranch:
         return "\n".join(lines)
 
 
+@host_side
 def continue_torus(
     torus: Torus, *, parameter: str, bounds: tuple[float, float], step: float = 0.02,
     max_step: float = 0.2, max_points: int = 200, max_nodes: int = MOST, progress: bool = True,

@@ -3,7 +3,7 @@
 import equinox as eqx
 import numpy as np
 
-from .._checks import count, flag
+from .._checks import count, flag, host_side
 from .._messages import ReportProgress, at_work, silent
 from .._types import State
 from ..flow import MethodLike
@@ -64,6 +64,7 @@ class EdgeState(Summarized):
         )
 
 
+@host_side
 def edge_state(
     machine: AbstractMachine,
     inside: Orbit | State,

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool
 
-from .._checks import flag, given_number, one_of
+from .._checks import flag, given_number, host_side, one_of
 from .._messages import at_work
 from .._types import State
 from ..machine import AbstractMachine, Summarized, in_rows, is_autonomous, without_modes
@@ -54,6 +54,7 @@ class Manifold(Summarized):
         return f"{self.which.capitalize()} manifold of a saddle: {', '.join(parts)}"
 
 
+@host_side
 def manifold(
     orbit: Orbit,
     *,

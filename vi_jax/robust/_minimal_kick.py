@@ -22,7 +22,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._checks import count, flag, given_number, interval, on_host
+from .._checks import count, flag, given_number, host_side, interval, on_host
 from .._messages import at_work
 from .._types import State
 from ..flow import MethodLike
@@ -398,6 +398,7 @@ class MinimalKick(Summarized):
         return "\n".join(lines)
 
 
+@host_side
 def minimal_kick(
     machine: AbstractMachine,
     orbit: Orbit | State,

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._checks import count, given_number
+from .._checks import count, given_number, host_side
 from .._messages import count_of, in_parts, warning_once
 from .._types import State, xr
 from ..flow import MethodLike, in_names, machine_of, tidy
@@ -139,6 +139,7 @@ class AllOrbits:
         return "\n".join(lines)
 
 
+@host_side
 @warning_once
 def all_orbits(
     machine: AbstractMachine,

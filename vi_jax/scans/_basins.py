@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import axes_of, count, fits_records, given_number, on_host
+from .._checks import axes_of, count, fits_records, given_number, host_side, on_host
 from .._messages import at_work, count_of, warning_once
 from .._types import State, xr
 from ..flow import (
@@ -394,6 +394,7 @@ def _last_sections(
     return states, np.reshape(modes, (-1, len(states))).T
 
 
+@host_side
 @warning_once
 def basins(
     machine: AbstractMachine,
@@ -627,6 +628,7 @@ class IntegrityProfile(NamedTuple):
         return "\n".join(lines)
 
 
+@host_side
 @warning_once
 def integrity_profile(
     machine: AbstractMachine,

@@ -20,7 +20,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
 from .. import lanes
-from .._checks import axes_of, count, fits_records, flag, instance_of
+from .._checks import axes_of, count, fits_records, flag, host_side, instance_of
 from .._messages import IN_PARTIAL, at_work, warn, warning_once
 from .._programs import PLAIN, CompiledFunction
 from .._types import State, xr
@@ -305,6 +305,7 @@ class LanesFailed(UserWarning):
     """The warning that some lanes of a scan failed."""
 
 
+@host_side
 @warning_once
 def scan(
     machine: AbstractMachine | Callable[..., AbstractMachine],
