@@ -435,6 +435,11 @@ def from_host(tree: Any) -> Any:
     return jtu.tree_map(put, tree)
 
 
+def is_traced(*values: Any) -> bool:
+    """Return whether a number in one of these trees is being traced."""
+    return any(isinstance(x, Tracer) for x in jtu.tree_leaves(values))
+
+
 def host_side(verb: Callable[P, R]) -> Callable[P, R]:
     """Decorator: raise a `TypeError` if an argument is being traced. NumPy would raise one later,
     which names no argument."""
@@ -442,7 +447,7 @@ def host_side(verb: Callable[P, R]) -> Callable[P, R]:
     @wraps(verb)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
         for value in (*args, *kwargs.values()):
-            if any(isinstance(x, Tracer) for x in jtu.tree_leaves(value)):
+            if is_traced(value):
                 raise TypeError(
                     f"Arguments of `{verb.__name__}` must hold known numbers, but a number of the "
                     f"`{type(value).__name__}` is being traced: call `{verb.__name__}` outside of "

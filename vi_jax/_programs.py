@@ -21,7 +21,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
 
-from ._checks import unwritable
+from ._checks import is_traced, unwritable
 from ._loading import without_collection
 from .lanes import (
     Unsupported,
@@ -189,7 +189,7 @@ def _kind_of(*arguments: Any) -> Any:
 
 def is_outermost(*arguments: Any) -> bool:
     """Return whether a call is outside any other program. Only then JAX takes compiler options."""
-    if any(isinstance(x, Tracer) for x in jtu.tree_leaves(arguments)):
+    if is_traced(*arguments):
         return False
     return not isinstance(jax.device_put(_NOTHING), Tracer)
 

@@ -326,14 +326,17 @@ class Held(vi.AbstractMachine):
 """
 
 
+# Without a stop, with which the programs of orbits are large.
+FREE = HELD.replace("    contacts", "    # contacts")
+
+
 @pytest.fixture
 def held(here, request):
-    """Write a file, of a name that no other test uses, and return the name of its machine. Orbits
-    have no stop, with which their programs are large."""
-    is_free = request.node.name == "test_scan_and_orbit_with_a_delay"
-    text = HELD.replace("    contacts", "    # contacts") if is_free else HELD
-    (here / f"{request.node.name}.py").write_text(text, encoding="utf-8")
-    return f"{request.node.name}.py:Held"
+    """Write a file, of a name that no other test uses, and return the name of its machine. The text
+    of the file is the fixture's parameter, by default `HELD`."""
+    file = f"{request.node.originalname}.py"
+    (here / file).write_text(getattr(request, "param", HELD), encoding="utf-8")
+    return f"{file}:Held"
 
 
 def test_simulate_and_pictures(run, held):
@@ -349,6 +352,7 @@ def test_simulate_and_pictures(run, held):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("held", [FREE], indirect=True, ids=["without a stop"])
 def test_scan_and_orbit_with_a_delay(run, held):
     head, picture = f"machine = '{held}'\n", "settle = 20\npicture = 'p.png'\n"
     axes = "[scan.axes]\ngain = [0.2, 0.3]\ndelay = [0.5, 1.0]"

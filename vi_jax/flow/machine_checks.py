@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from .._checks import concrete, named_leaves, outside_of_traces, returned
+from .._checks import concrete, is_traced, named_leaves, outside_of_traces, returned
 from .._messages import warn
 from .._types import Scalar, Scalars, State
 from ..lanes import dependent_results
@@ -209,8 +209,8 @@ def check_values(machine: AbstractMachine, start: State, repeats: bool = True) -
     motion `repeats` its cycle, or if an event's guard is not negative in any of many states.
     Machines of this package and machines with traced numbers are not checked."""
     machine = getattr(machine, "observed_machine", machine)  # so that it is not checked twice
-    kind, leaves = type(machine), jtu.tree_leaves((machine, start))
-    if is_builtin(kind) or any(isinstance(x, Tracer) for x in leaves):
+    kind = type(machine)
+    if is_builtin(kind) or is_traced(machine, start):
         return
     _check_slips(machine, start)
     _check_friction_forces(machine, start)

@@ -8,10 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.core import Tracer
 from jax.extend.core import Jaxpr
 from jax.lax import stop_gradient
 
+from .._checks import is_traced
 from .._types import Flag, Scalar, Scalars, State
 from ..lanes import called, propagate_marks
 from ..machine import (
@@ -22,6 +22,7 @@ from ..machine import (
     field_in,
     frictions_in,
     has_contact_friction,
+    held_alone,
     holds_anywhere,
     limited_in,
     push_of,
@@ -45,8 +46,7 @@ class SmoothMachine(eqx.Module):
 
     def field(self, s: Scalar, state: State) -> State:
         """Return d(state)/ds, without motion of held bodies."""
-        traced = any(isinstance(x, Tracer) for x in jtu.tree_leaves((self, s, state)))
-        if not traced:
+        if not is_traced(self, s, state):
             return self.held_field(s, state)
         if not self._holds_one or holds_anywhere(self.machine):
             return _traced_once(self, s, state)
@@ -109,17 +109,21 @@ def hold_contacts(
     others = (x if j != but else jnp.zeros_like(x) for j, x in enumerate(contact))
     frictions = frictions_in(machine)
     if but is not None and len(frictions) > 1:  # a redundant one may hold without it
-        free = lambda x: jnp.where(jnp.abs(x) == 0.25, 0.0, x)
-        modes = tuple(free(x) if i in frictions else x for i, x in enumerate(modes))
+        modes = tuple(held_alone(x) if i in frictions else x for i, x in enumerate(modes))
     return SmoothMachine(machine, modes, tuple(others))
 
 
 def stops_are_exact(machine: AbstractMachine, state: State) -> bool:
     """Return whether stops limit only one number of the state itself, so that it can be put on a
     stop without rounding. The result is known at trace time."""
-    position = machine.coordinates[0].position(state)
-    is_number_of_state = any(position is x for x in jtu.tree_leaves(state))
-    return is_number_of_state and len(machine.coordinates) == 1
+    return is_number_of(machine.coordinates[0], state) and len(machine.coordinates) == 1
+
+
+def is_number_of(coordinate: Coordinate, state: State) -> bool:
+    """Return whether the position of a coordinate is a number of the state itself; known at trace
+    time."""
+    position = coordinate.position(state)
+    return any(position is x for x in jtu.tree_leaves(state))
 
 
 # Primitives that are linear in all of their operands together, and in each of them.

@@ -36,8 +36,8 @@ from .events import (
     sides_of, struck_modes,
 )
 from .friction import (
-    ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_contacts, settled_modes,
-    shared_loads, slip_in,
+    ContactFriction, DryFriction, frictions_in, held_alone, pressed_contacts, settled_contacts,
+    settled_modes, shared_loads, slip_in,
 )
 from .leaves import (
     by_name, check_again, check_leaf, check_name, components, first_few, in_rows, leaf, leaf_names,

@@ -619,6 +619,12 @@ def slip_in(mode: Scalar) -> Scalar:
     return jnp.where(jnp.abs(mode) < 1, 0.0, mode)
 
 
+def held_alone(mode: Scalar) -> Scalar:
+    """Return the mode of a friction that held its body with others, if it were alone. One that had
+    no force sticks: see `Friction`."""
+    return jnp.where(jnp.abs(mode) == 0.25, 0.0, mode)
+
+
 def frictions_in(machine: Machine) -> list[int]:
     """Return the indices of the frictions among a machine's switches."""
     switches = enumerate(switches_of(machine))

@@ -15,9 +15,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
-from .._checks import concrete, returned
+from .._checks import concrete, is_traced, returned
 from .._types import Scalar, State
 from ..lanes import dependent_results
 from .base import AbstractMachine, cached_in_trace, contacts_in
@@ -335,8 +334,7 @@ def _once(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def of_gap(machine: Mechanical, on: Any, state: Any) -> Any:
-        traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((machine, state)))
-        if traced and isinstance(on, _Gap) and on.number is not None:
+        if is_traced(machine, state) and isinstance(on, _Gap) and on.number is not None:
             return of_number(machine, on.number, state)
         return function(machine, on, state)
 

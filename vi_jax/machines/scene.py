@@ -9,9 +9,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._checks import (
@@ -23,6 +21,7 @@ from .._checks import (
     concrete,
     in_range,
     instance_of,
+    is_traced,
     number,
     on_host,
     one_of,
@@ -566,7 +565,7 @@ class Parameters(Shown):
                 no_load_speed=no_load,
             )
         damping = self.damping / (2 * self.body_mass * omega)
-        if any(isinstance(x, Tracer) for x in jtu.tree_leaves(self)):
+        if is_traced(self):
             # Some parameters out of range give a scene with parameters in range.
             damping = jnp.where(in_range(self), damping, jnp.nan)
         exact = SliderCrank(self.crank_radius / self.rod_length) if crank == "slider" else None

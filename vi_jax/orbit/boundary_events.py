@@ -37,7 +37,7 @@ from .kinds import (
 from .locate import MOST_SAMPLES, SPACING, crossing
 from .sliding import change_at_event, vanishing_part
 from .tolerances import ALIKE, FAINT, ROUNDING, SAME
-from .walk import Ending, Event, Table, bound_rows
+from .walk import Ending, Event, Table, common_rows
 
 # The intervals of the first and of the second parameter.
 Intervals = tuple[tuple[float, float], tuple[float, float]]
@@ -65,7 +65,7 @@ class SpecialTable(Table):
 
     def event_rows(self, here: Step, new: Step) -> list[Event]:
         return [
-            *bound_rows(self), *self._grazing_rows(here), *self._sliding_rows(),
+            *common_rows(self), *self._grazing_rows(here), *self._sliding_rows(),
             *self._resonance_rows(), *self._symmetry_rows(here), *self.closing.rows(here, new),
         ]  # fmt: skip
 

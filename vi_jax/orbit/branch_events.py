@@ -63,7 +63,7 @@ from .results import Orbit
 from .sliding import change_at, locate_change, vanishing_part
 from .special import Point, further_of, point_at
 from .tolerances import ALIKE, BRIEF, FAINT, LOCATED, NEARBY, ON_CIRCLE, ROUNDING, SAME
-from .walk import SAME_CURVE, Ending, Event, Table, bound_rows
+from .walk import SAME_CURVE, Ending, Event, Table, common_rows
 from .words import coincidence_in_words, grazing_in_words, place_in_words
 
 # These thresholds are choices; measured ones have the figure in the comment.
@@ -114,7 +114,7 @@ class MotionTable(Table):
         )
 
     def event_rows(self, here: Step, new: Step) -> list[Event]:
-        rows = bound_rows(self)
+        rows = common_rows(self)
         if self.problem.autonomous:
             self.duration = self.duration or float(here.observed.duration)
             remaining = lambda step: _LONG - float(step.observed.duration) / self.duration

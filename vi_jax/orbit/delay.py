@@ -5,9 +5,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.core import Tracer
 
-from .._checks import from_host, on_host
+from .._checks import from_host, is_traced, on_host
 from .._programs import compiled
 from ..flow import history_of_function, simulate, sizes_on_host, unit_of
 from ..machine import (
@@ -53,7 +52,7 @@ def with_delay_error(orbit: Orbit) -> Orbit:
     """Return a single orbit of a chain with its difference from a run with the whole history."""
     chain: Any = orbit.machine
     machine = machine_of_chain(chain)
-    if machine is None or any(isinstance(x, Tracer) for x in jax.tree.leaves(orbit)):
+    if machine is None or is_traced(orbit):
         return orbit
     if orbit.residual.ndim or not bool(orbit.successful):
         return orbit

@@ -757,7 +757,7 @@ class Shooting(eqx.Module):
                 forces = jax.vmap(force)(*path)
                 largest = jnp.max(jnp.abs(forces))
                 share = jnp.min(forces) / jnp.where(largest > 0, largest, 1.0)
-                least = jnp.minimum(least, jnp.where(largest > 0, share, 1.0))
+                least = jnp.minimum(least, share)
         return least
 
     def _modes_agree(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import count, given_number, host_side, instance_of
+from .._checks import count, given_number, host_side, instance_of, on_host
 from .._messages import count_of
 from .._programs import compiled
 from .._types import Scalar, State
@@ -128,8 +128,7 @@ class Torus:
         """Return the states on the section at angles θ, in turns; leaves have their shape."""
         angle = np.asarray(angle, float)
         rows = self.equations.on_section(self.curve, np.mod(angle.ravel(), 1.0))
-        states = self.problem.unravel(rows)
-        return jax.tree.map(lambda a: np.asarray(a).reshape(angle.shape + a.shape[1:]), states)
+        return on_host(self.problem.unravel(rows.reshape(*angle.shape, -1)))
 
     @cached_property
     def tail(self) -> float:

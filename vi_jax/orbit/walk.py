@@ -340,7 +340,9 @@ def rescaled(steps: list[Step], before: np.ndarray, after: np.ndarray) -> list[S
     return [step._replace(tangent=tangent(step)) for step in steps]
 
 
-def bound_rows(table: Table) -> list[Event]:
+def common_rows(table: Table) -> list[Event]:
+    """Return the rows of every curve: the bounds of its parameters, and negative loads."""
+
     def row(i: int, bound: float, sense: float) -> Event:
         def distance(step: Step) -> float:
             return sense * (float(step.x[i]) - bound) / float(table.scale[i])

@@ -38,7 +38,7 @@ from ..lane import Lane, any_of, select, to_event
 from ..methods import Stage
 from ..plan import Plan
 from ..sizes import guard_rounding
-from ..smooth import SmoothMachine, is_affine, stops_are_exact
+from ..smooth import SmoothMachine, is_affine, is_number_of, stops_are_exact
 from .roots import Field, Rates, guard_rates, landing, rate_of_position, rates
 
 # Places in a step of a motion known in advance where guards are evaluated, as shares of it.
@@ -358,8 +358,7 @@ def crossings(
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
         for i, stop in enumerate(stops_of(machine)):
-            place = machine.coordinates[stop.coordinate].position(new)
-            if not any(place is x for x in jtu.tree_leaves(new)):  # its terms may cancel
+            if not is_number_of(machine.coordinates[stop.coordinate], new):  # its terms may cancel
                 slack = plan.rounding_bounds(stop.coordinate, new)[0]
                 guards[i] = guards[i]._replace(slack=slack)
         guards = _with_own_rounding(plan, lane, (s1, new), guards)
